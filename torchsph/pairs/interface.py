@@ -1,0 +1,182 @@
+"""The one interface to the pair sums: what a backend reads, which sums it can be asked for, what it returns.
+
+Quantities are in any consistent units; the simulator calls with lengths in particle spacings and velocities in its
+reference speed.  All particles of all members stand in one flat array, ordered as the caller likes, and ``member``
+says to which member each belongs: particles of different members never interact.  Density is carried as its relative
+deviation  d = (rho - rho0) / rho0,  because float32 would lose it in rho; pressure is p / rho0 and mass is m / rho0, so
+that  m / (1 + d)  is a volume.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ..smoothing import SmoothingKernel
+
+CONTINUITY_FORMS = ("volume", "mass")
+PRESSURE_FORMS = ("symmetric", "sum", "switched", "difference")
+
+
+@dataclass(frozen=True)
+class Support:
+    """Kernel and smoothing length of a pass; ``length`` is a float or a tensor (members,)."""
+
+    kernel: SmoothingKernel
+    length: float | Tensor
+    dimension: int
+
+    @property
+    def radius(self) -> float:
+        """Largest support radius over the members."""
+        longest = float(self.length.max()) if isinstance(self.length, Tensor) else self.length
+        return self.kernel.support * longest
+
+
+@dataclass(frozen=True)
+class PairState:
+    """Flat particle arrays that a pass reads.
+
+    Attributes:
+        position: (N, D).
+        velocity: (N, D).
+        mass: (N,), m / rho0.
+        deviation: (N,), (rho - rho0) / rho0.
+        pressure: (N,), p / rho0; only the momentum pass reads it.
+        member: (N,) int64.
+    """
+
+    position: Tensor
+    velocity: Tensor
+    mass: Tensor
+    deviation: Tensor
+    pressure: Tensor
+    member: Tensor
+
+    @property
+    def volume(self) -> Tensor:
+        """m / rho, (N,)."""
+        return self.mass / (1.0 + self.deviation)
+
+
+@dataclass(frozen=True)
+class RateTerms:
+    """Which first-pass sums are wanted; a sum that is not asked for is neither computed nor stored.
+
+    Attributes:
+        continuity: "volume":  sum_b V_b (v_b - v_a) . grad W  (velocity divergence);
+            "mass":  sum_b m_b (v_b - v_a) . grad W  (minus the density rate of 2.19); None: not wanted.
+        diffusion: sum_b 2 V_b (d_b - d_a) (x_b - x_a) . grad W / r^2 with the sign that spreads d
+            (Molteni & Colagrossi 2009 eq. 2 without its prefactor).
+        concentration: sum_b V_b grad W (particle shifting, Lind et al. 2012 eq. 23).
+        xsph: sum_b 2 m_b / (rho_a + rho_b) (v_b - v_a) W (errata to 2.33).
+        shepard: sums of V_b W and of m_b W over b, with b = a (2.20).
+        renormalisation: sum_b V_b (x_b - x_a) (x) grad W (Bonet & Lok 1999 eq. 45), (N, D, D).
+    """
+
+    continuity: str | None = "volume"
+    diffusion: bool = False
+    concentration: bool = False
+    xsph: bool = False
+    shepard: bool = False
+    renormalisation: bool = False
+
+    def __post_init__(self) -> None:
+        if self.continuity is not None and self.continuity not in CONTINUITY_FORMS:
+            raise ValueError(f"continuity must be one of {CONTINUITY_FORMS} or None, got '{self.continuity}'")
+
+
+@dataclass(frozen=True)
+class Rates:
+    """First-pass sums; a sum that was not asked for is None."""
+
+    divergence: Tensor | None = None
+    diffusion: Tensor | None = None
+    concentration: Tensor | None = None
+    xsph: Tensor | None = None
+    shepard_volume: Tensor | None = None
+    shepard_mass: Tensor | None = None
+    renormalisation: Tensor | None = None
+
+
+@dataclass(frozen=True)
+class MomentumTerms:
+    """Which accelerations the second pass adds up; every coefficient is a float or a tensor (members,).
+
+    Attributes:
+        pressure: "symmetric": -sum m_b (p_a/rho_a^2 + p_b/rho_b^2) grad W (2.23);
+            "sum": -sum m_b (p_a + p_b)/(rho_a rho_b) grad W (Colagrossi & Landrini 2003 eq. 8);
+            "switched": as "sum" with p_a replaced by |p_a| (Sun et al. 2017 eq. 11: tensile control);
+            "difference": as "sum" with -p_a (exact for constant pressure, not conservative); None: no pressure.
+        artificial: alpha * c in 2.29 (speed); None switches the artificial viscosity off.
+        laminar: kinematic viscosity nu of Morris, Fox & Zhu 1997 eq. 22; None switches it off.
+        tensile: coefficient R of Monaghan 2000 (0.2 there, for the symmetric form); None switches it off.
+        tensile_distance: distance at which its weight (W(r)/W(r0))^4 is one (the particle spacing).
+    """
+
+    pressure: str | None = "symmetric"
+    artificial: float | Tensor | None = None
+    laminar: float | Tensor | None = None
+    tensile: float | None = None
+    tensile_distance: float = 1.0
+
+    def __post_init__(self) -> None:
+        if self.pressure is not None and self.pressure not in PRESSURE_FORMS:
+            raise ValueError(f"pressure must be one of {PRESSURE_FORMS} or None, got '{self.pressure}'")
+
+
+class Backend(ABC):
+    """A way to evaluate the pair sums.  ``pairs`` is whatever ``search`` returned; it is opaque to the caller."""
+
+    name: str
+
+    @abstractmethod
+    def search(
+        self, position: Tensor, member: Tensor, radius: float, *, margin: float = 0.0,
+        period: Tensor | None = None,
+    ) -> Any:
+        """Find the pairs closer than ``radius + margin``.
+
+        The result serves until a particle has moved by ``margin / 2``. ``period`` (D,) gives the period of each axis
+        (inf: not periodic). Raises ValueError for a non-finite position or a period shorter than three radii.
+        """
+
+    @abstractmethod
+    def rates(self, pairs: Any, state: PairState, support: Support, terms: RateTerms) -> Rates:
+        """First pass: sums over neighbours that need positions, velocities and densities."""
+
+    @abstractmethod
+    def momentum(self, pairs: Any, state: PairState, support: Support, terms: MomentumTerms) -> Tensor:
+        """Second pass: acceleration (N, D)."""
+
+    @abstractmethod
+    def laplacian(
+        self, pairs: Any, state: PairState, support: Support, field: Tensor, active: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """sum_b 2 V_b (-F) r^2/(r^2 + 0.01 h^2) (field_a - field_b) and its diagonal, both (N,).
+
+        ``active`` (N,) bool: only pairs of two active particles count (None: all).
+        """
+
+
+def per_particle(value: float | Tensor, member: Tensor) -> float | Tensor:
+    """A coefficient given per member, (members,), spread over the particles (N,); a float stays a float."""
+    return value.index_select(0, member) if isinstance(value, Tensor) and value.ndim else value
+
+
+def check_search(position: Tensor, radius: float, period: Tensor | None) -> None:
+    """Raise ValueError where no backend could search: non-finite positions, or a period under three radii."""
+    if radius <= 0:
+        raise ValueError(f"the search radius must be positive, got {radius}")
+    if not torch.isfinite(position).all():
+        bad = int((~torch.isfinite(position).all(dim=1)).sum())
+        raise ValueError(f"{bad} particle positions are not finite; freeze or remove them before the search")
+    if period is not None and bool((period < 3 * radius).any()):
+        raise ValueError(
+            f"a periodic axis of length {float(period.min()):g} is shorter than three search radii ({3 * radius:g}); "
+            "use a finer spacing or a longer period"
+        )

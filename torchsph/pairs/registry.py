@@ -1,0 +1,44 @@
+"""Which backends this machine has, and the choice among them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from .interface import Backend
+from .reference import ReferenceBackend
+
+
+@dataclass(frozen=True)
+class BackendStatus:
+    """Whether a backend can be used here, and why (not)."""
+
+    name: str
+    present: bool
+    reason: str
+
+
+def available_backends(device: str = "cpu") -> list[BackendStatus]:
+    """The backends known to the project, best first, with the reason why each can or cannot be used on ``device``."""
+    return [BackendStatus("reference", True, "plain torch, any device, always present")]
+
+
+def backend(name: str = "auto", device: str = "cpu") -> Backend:
+    """The backend called ``name``, or the best one that is present for "auto".
+
+    Raises:
+        ValueError: the name is unknown, or the backend was asked for by name and is missing (the reason and the cure
+            are in the message; nothing slower is taken silently in its place).
+    """
+    known = available_backends(device)
+    if name == "auto":
+        return _make(next(status.name for status in known if status.present))
+    for status in known:
+        if status.name == name:
+            if not status.present:
+                raise ValueError(f"backend '{name}' was asked for and cannot be used: {status.reason}")
+            return _make(name)
+    raise ValueError(f"unknown backend '{name}'; known: auto, {', '.join(status.name for status in known)}")
+
+
+def _make(name: str) -> Backend:
+    return {"reference": ReferenceBackend}[name]()

@@ -1,0 +1,113 @@
+"""Neighbour search in plain torch: cells of the search radius, sorted keys, each unordered pair found once."""
+
+from __future__ import annotations
+
+import itertools
+
+import torch
+from torch import Tensor
+
+
+def half_pairs(
+    position: Tensor, member: Tensor, radius: float, period: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    """All pairs of one member closer than ``radius``; every pair once, sorted by its first particle.
+
+    Cells are addressed by sorted keys, not by a dense table, so that a stray particle far away costs nothing and no
+    cell can overflow.
+
+    Args:
+        position: (N, D), finite. member: (N,) int64. radius: same unit as the positions.
+        period: (D,) period of each axis, inf where it is not periodic; at least three radii.
+
+    Returns:
+        first, second: (P,) int64 particle indices.
+    """
+    count, dimension = position.shape
+    if count == 0:
+        empty = torch.zeros(0, dtype=torch.int64, device=position.device)
+        return empty, empty
+    cell, cells = _cells(position, radius, period)
+    key = _key(cell, member, cells)
+    order = torch.argsort(key, stable=True)
+    sorted_key, sorted_cell, sorted_member = key[order], cell[order], member[order]
+    rank = torch.arange(count, device=position.device)
+    firsts, seconds = [], []
+    for offset in _half_offsets(dimension):
+        if any(offset):
+            target, real = _shifted(sorted_cell, offset, cells, period)
+            wanted = _key(target, sorted_member, cells)
+            start = torch.searchsorted(sorted_key, wanted)
+            stop = torch.searchsorted(sorted_key, wanted, right=True)
+            stop = torch.where(real, stop, start)
+        else:
+            start, stop = rank + 1, torch.searchsorted(sorted_key, sorted_key, right=True)
+        first, second = _expand(start, stop)
+        first, second = order[first], order[second]
+        close = _square_distance(position, first, second, period) < radius * radius
+        firsts.append(first[close])
+        seconds.append(second[close])
+    first, second = torch.cat(firsts), torch.cat(seconds)
+    by_first = torch.argsort(first, stable=True)
+    return first[by_first], second[by_first]
+
+
+def _cells(position: Tensor, radius: float, period: Tensor | None) -> tuple[Tensor, Tensor]:
+    """Cell index (N, D) and number of cells (D,) of every axis; periodic axes hold a whole number of cells."""
+    lower = position.amin(0)
+    width = torch.full_like(lower, radius)
+    if period is not None:
+        periodic = torch.isfinite(period)
+        length = torch.where(periodic, period, torch.ones_like(period)).to(position.dtype)
+        width = torch.where(periodic, length / torch.floor(length / radius).clamp_min(1), width)
+        wrapped = torch.remainder(position, length)
+        position = torch.where(periodic, wrapped, position)
+        lower = torch.where(periodic, torch.zeros_like(lower), lower)
+    cell = torch.floor((position - lower) / width).to(torch.int64)
+    cells = cell.amax(0) + 1
+    if period is not None:
+        whole = torch.round(length / width).to(torch.int64)
+        cells = torch.where(periodic, whole, cells)
+        cell = torch.minimum(cell, cells - 1)  # x just below the period rounds up to it
+    return cell, cells
+
+
+def _key(cell: Tensor, member: Tensor, cells: Tensor) -> Tensor:
+    key = member
+    for axis in range(cell.shape[1] - 1, -1, -1):
+        key = key * cells[axis] + cell[:, axis]
+    return key
+
+
+def _half_offsets(dimension: int) -> list[tuple[int, ...]]:
+    """The zero offset and one of each pair of opposite neighbour offsets."""
+    return [o for o in itertools.product((-1, 0, 1), repeat=dimension) if o >= (0,) * dimension]
+
+
+def _shifted(
+    cell: Tensor, offset: tuple[int, ...], cells: Tensor, period: Tensor | None
+) -> tuple[Tensor, Tensor]:
+    """Neighbouring cell, wrapped on periodic axes, and whether it exists."""
+    target = cell + torch.tensor(offset, device=cell.device)
+    if period is not None:
+        target = torch.where(torch.isfinite(period), torch.remainder(target, cells), target)
+    real = ((target >= 0) & (target < cells)).all(1)
+    return target, real
+
+
+def _expand(start: Tensor, stop: Tensor) -> tuple[Tensor, Tensor]:
+    """For every row r the pairs (r, start[r]), ..., (r, stop[r] - 1)."""
+    length = stop - start
+    row = torch.repeat_interleave(torch.arange(start.shape[0], device=start.device), length)
+    begin = torch.cumsum(length, 0) - length
+    within = torch.arange(row.shape[0], device=start.device) - begin[row]
+    return row, start[row] + within
+
+
+def _square_distance(position: Tensor, first: Tensor, second: Tensor, period: Tensor | None) -> Tensor:
+    gap = position.index_select(0, first) - position.index_select(0, second)
+    if period is not None:
+        finite = torch.isfinite(period)
+        length = torch.where(finite, period, torch.ones_like(period)).to(position.dtype)
+        gap = torch.where(finite, gap - length * torch.round(gap / length), gap)
+    return (gap * gap).sum(1)
