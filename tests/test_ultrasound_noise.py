@@ -1,5 +1,4 @@
-"""The noise model has the statistics that it states, on a vortex in a tube; nothing here depends on a
-phantom."""
+"""The noise model has the statistics that it states, on a vortex in a box; no phantom is involved."""
 
 import dataclasses
 import math
@@ -39,8 +38,8 @@ def box_wall(low, high):
 
 
 def recording(field, frames=4, shape=(24, 18, 20)):
-    """A 3-D recording of field(x, y, z) -> (3, ...) m/s, positions in metres from the middle of a 1 mm
-    grid.""" spacing = np.full(3, 1e-3)
+    """A 3-D recording of field(x, y, z) -> (3, ...) m/s, metres from the middle of a 1 mm grid."""
+    spacing = np.full(3, 1e-3)
     origin = -0.5 * spacing * (np.array(shape[::-1]) - 1)
     grid = geometry.Grid(origin=origin, spacing=spacing, shape=shape)
     z, y, x = np.meshgrid(

@@ -1,5 +1,4 @@
-"""Averages, noise and derivatives of grid fields; arrays are (..., *shape), spacings come in the order x,
-y, z."""
+"""Averages, noise and derivatives of grid fields (..., *shape); spacings come in the order x, y, z."""
 
 from __future__ import annotations
 
@@ -28,8 +27,8 @@ def gaussian_kernel(deviation: float, step: float, *, dtype: torch.dtype = torch
 
 
 def convolve_axis(field: Tensor, kernel: Tensor, axis: int, *, padded: bool) -> Tensor:
-    """Correlate ``field`` with ``kernel`` along one axis; zeros outside if ``padded``, else only where it
-    fits.""" moved = field.movedim(axis, -1)
+    """Correlate ``field`` with ``kernel`` along one axis; zeros outside if ``padded``, else cropped."""
+    moved = field.movedim(axis, -1)
     rows = moved.reshape(-1, 1, moved.shape[-1])
     rows = F.conv1d(rows, kernel.to(rows).view(1, 1, -1), padding=kernel.numel() // 2 if padded else 0)
     return rows.reshape(*moved.shape[:-1], rows.shape[-1]).movedim(-1, axis)

@@ -180,8 +180,8 @@ def frame_seed(seed: int, frame: int) -> int:
 
 
 def _mean_growth(true: Recording, spacing: tuple[float, ...], options: NoiseModel) -> float:
-    """RMS of the growth factor over the mask and all frames, so that ``lateral`` and ``axial`` are RMS
-    values.""" total, nodes = 0.0, 0
+    """RMS of the growth factor over the mask and all frames: it makes ``lateral`` an RMS value."""
+    total, nodes = 0.0, 0
     for frame in range(len(true.time)):
         mask = torch.from_numpy(np.ascontiguousarray(true.mask[frame], bool))
         velocity = torch.from_numpy(np.ascontiguousarray(true.velocity[frame], np.float32))
