@@ -1,0 +1,68 @@
+"""Output files that appear whole or not at all."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+__all__ = ["output_folder", "staged", "write_json"]
+
+
+def output_folder(path: str | Path) -> Path:
+    """`path` as a folder that results may be written to; `ValueError` if something else stands there.
+
+    Asked before the work starts: a run of minutes must not end in a name that cannot be written.
+    """
+    folder = Path(path)
+    existing = next(p for p in (folder, *folder.absolute().parents) if p.exists())
+    if not existing.is_dir():
+        raise ValueError(f"--out {folder}: {existing} is a file, not a folder; choose another folder")
+    if not os.access(existing, os.W_OK | os.X_OK):
+        raise ValueError(f"--out {folder}: no permission to write in {existing}; choose another folder")
+    return folder
+
+
+@contextmanager
+def staged(folder: str | Path) -> Iterator[Path]:
+    """A scratch folder whose files move into `folder` when the block ends well, and vanish when it does not."""
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    scratch = Path(tempfile.mkdtemp(prefix=".torchsph-", dir=folder))
+    try:
+        yield scratch
+        for file in sorted(scratch.iterdir()):
+            os.replace(file, folder / file.name)
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
+        with suppress(OSError):  # the folder holds files already: the usual case, and then it stays
+            folder.rmdir()
+
+
+def write_json(path: str | Path, content: Any) -> None:
+    """Strict JSON: arrays become lists, and what is not finite becomes `null`, which every reader takes."""
+    Path(path).write_text(json.dumps(_plain(content), indent=1, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(item) for item in value]
+    if isinstance(value, np.ndarray):
+        return _plain(value.tolist())
+    if isinstance(value, np.generic):
+        return _plain(value.item())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    if value is None or isinstance(value, (str, bool, int, float)):
+        return value
+    return str(value)  # a path, a device, a dtype: by its name
