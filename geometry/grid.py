@@ -1,0 +1,219 @@
+"""A regular grid: where its nodes are, multilinear sampling at points, and the exact adjoint of that sampling.
+
+Grid arrays are indexed `[..., z, y, x]` (`[..., y, x]` in a plane) and a value sits AT its node; points hold their
+coordinates in the order x, y, z. Everything is linear in the field, differentiable by torch in field and points, and
+runs in the dtype and on the device of what it is given.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import product
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+OUTSIDE = ("clamp", "zero")
+
+
+class Stencil(NamedTuple):
+    """The 2^D nodes around each point: flat node numbers and weights, both `(*batch, n, 2^D)`."""
+
+    index: Tensor
+    weight: Tensor
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Nodes at `origin + spacing * (i, j, k)`.
+
+    `origin` and `spacing` are metres in the order x, y, z; `shape` is in array order (nz, ny, nx). Raises ValueError
+    where they disagree in length, a spacing is not positive or an axis has no node.
+    """
+
+    origin: tuple[float, ...]
+    spacing: tuple[float, ...]
+    shape: tuple[int, ...]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "origin", tuple(float(value) for value in self.origin))
+        object.__setattr__(self, "spacing", tuple(float(value) for value in self.spacing))
+        object.__setattr__(self, "shape", tuple(int(value) for value in self.shape))
+        if not len(self.origin) == len(self.spacing) == len(self.shape) or len(self.shape) not in (2, 3):
+            raise ValueError(
+                f"Grid: origin, spacing and shape must all have 2 or all have 3 numbers, "
+                f"not {len(self.origin)}, {len(self.spacing)} and {len(self.shape)}"
+            )
+        if not all(math.isfinite(value) for value in self.origin):
+            raise ValueError(f"Grid: origin must be finite, not {self.origin}")
+        if not all(math.isfinite(value) and value > 0 for value in self.spacing):
+            raise ValueError(f"Grid: spacing must be positive and finite (metres), not {self.spacing}")
+        if not all(value >= 1 for value in self.shape):
+            raise ValueError(f"Grid: every axis needs at least one node, not shape {self.shape}")
+
+    @classmethod
+    def covering(
+        cls, lower: Sequence[float], upper: Sequence[float], spacing: float | Sequence[float]
+    ) -> Grid:
+        """The smallest grid of this spacing (m) that starts at `lower` and reaches `upper` (both D numbers, m)."""
+        steps = (spacing,) * len(lower) if isinstance(spacing, (int, float)) else tuple(spacing)
+        if not all(step > 0 for step in steps):
+            raise ValueError(f"Grid.covering: spacing must be positive, not {spacing}")
+        if not all(end >= start for start, end in zip(lower, upper, strict=True)):
+            raise ValueError(f"Grid.covering: upper {tuple(upper)} lies below lower {tuple(lower)}")
+        # The slack keeps 10 mm / 1 mm at 10 cells although the quotient may round to 10.000000000000002.
+        cells = [
+            math.ceil((end - start) / step - 1e-9)
+            for start, end, step in zip(lower, upper, steps, strict=True)
+        ]
+        return cls(tuple(lower), steps, tuple(max(count, 0) + 1 for count in reversed(cells)))
+
+    @property
+    def dimension(self) -> int:
+        """2 or 3."""
+        return len(self.shape)
+
+    @property
+    def size(self) -> int:
+        """Number of nodes."""
+        return math.prod(self.shape)
+
+    @property
+    def cell_volume(self) -> float:
+        """Volume of one cell, m^3 (area, m^2, in a plane)."""
+        return math.prod(self.spacing)
+
+    @property
+    def upper(self) -> tuple[float, ...]:
+        """The last node, x, y, z (m); the first one is `origin`."""
+        counts = reversed(self.shape)
+        return tuple(o + s * (n - 1) for o, s, n in zip(self.origin, self.spacing, counts, strict=True))
+
+    def axis(
+        self, number: int, *, dtype: torch.dtype = torch.float64, device: torch.device | str | None = None
+    ) -> Tensor:
+        """Node coordinates (m) along axis `number` (0 is x), `(nodes,)`."""
+        count = self.shape[self.dimension - 1 - number]
+        steps = torch.arange(count, dtype=torch.float64, device=device)
+        return (self.origin[number] + self.spacing[number] * steps).to(dtype)
+
+    def nodes(
+        self, *, dtype: torch.dtype = torch.float64, device: torch.device | str | None = None
+    ) -> Tensor:
+        """All nodes as points `(size, D)`, m, in the order of a flattened grid array (x fastest)."""
+        axes = [self.axis(number, dtype=dtype, device=device) for number in range(self.dimension)]
+        mesh = torch.meshgrid(*reversed(axes), indexing="ij")
+        return torch.stack([coordinate.reshape(-1) for coordinate in reversed(mesh)], dim=-1)
+
+    def locate(self, points: Tensor) -> Tensor:
+        """Points `(*batch, n, D)` in units of nodes from the origin, x, y, z."""
+        self._check_points(points)
+        return (points - points.new_tensor(self.origin)) / points.new_tensor(self.spacing)
+
+    def contains(self, points: Tensor, *, margin: float = 0.0) -> Tensor:
+        """Whether points `(*batch, n, D)` lie in the box of the nodes, grown by `margin` (m): bool `(*batch, n)`."""
+        self._check_points(points)
+        lower = points.new_tensor(self.origin) - margin
+        upper = points.new_tensor(self.upper) + margin
+        return ((points >= lower) & (points <= upper)).all(dim=-1)
+
+    def stencil(self, points: Tensor, *, outside: str = "clamp") -> Stencil:
+        """The nodes and weights that interpolate multilinearly at points `(*batch, n, D)`.
+
+        Outside the box, `clamp` takes the value at the nearest point of the box and `zero` gives weights of zero.
+        A stencil can be kept and passed to `sample` and `spread` for as long as the points stay where they are.
+        """
+        if outside not in OUTSIDE:
+            raise ValueError(f"Grid.stencil: outside must be one of {OUTSIDE}, not {outside!r}")
+        place = self.locate(points)
+        last = place.new_tensor([count - 1 for count in reversed(self.shape)])
+        place = torch.minimum(place.clamp(min=0), last)
+        lower = torch.minimum(place.detach().floor(), (last - 1).clamp(min=0))
+        fraction = place - lower
+        low = lower.long()
+        high = torch.minimum(low + 1, last.long())
+        index, weight = self._corners(low, high, fraction)
+        if outside == "zero":
+            weight = weight * self.contains(points).unsqueeze(-1)
+        return Stencil(index, weight)
+
+    def sample(self, field: Tensor, points: Tensor | Stencil, *, outside: str = "clamp") -> Tensor:
+        """Multilinear interpolation of `field (*lead, *shape)` at points: `(*lead, n)`.
+
+        `points` is `(n, D)` in metres, shared by all leading axes, or `(*batch, n, D)` where `batch` are the first
+        leading axes of the field; or the `Stencil` of such points. Raises ValueError where the shapes do not fit.
+        """
+        lead = self._lead(field)
+        stencil = points if isinstance(points, Stencil) else self.stencil(points, outside=outside)
+        batch = self._batch(stencil, lead)
+        flat = field.reshape(*lead, self.size)
+        result = 0.0
+        # One corner at a time: a gather of all 2^D at once would need 2^D times the memory.
+        for corner in range(stencil.index.shape[-1]):
+            index, weight = (self._broadcast(part[..., corner], batch, lead) for part in stencil)
+            result = result + flat.gather(-1, index) * weight.to(flat.dtype)
+        return result
+
+    def spread(self, values: Tensor, points: Tensor | Stencil, *, outside: str = "clamp") -> Tensor:
+        """The exact adjoint of `sample`: add `values (*lead, n)` to the nodes around the points: `(*lead, *shape)`.
+
+        `<spread(a), b> = <a, sample(b)>` for every a and b. No division by the cell volume takes place.
+        """
+        lead = tuple(values.shape[:-1])
+        stencil = points if isinstance(points, Stencil) else self.stencil(points, outside=outside)
+        batch = self._batch(stencil, lead)
+        if values.ndim == 0 or values.shape[-1] != stencil.index.shape[-2]:
+            raise ValueError(
+                f"Grid.spread: {tuple(values.shape)} values for {stencil.index.shape[-2]} points"
+            )
+        flat = values.new_zeros(*lead, self.size)
+        for corner in range(stencil.index.shape[-1]):
+            index, weight = (self._broadcast(part[..., corner], batch, lead) for part in stencil)
+            flat = flat.scatter_add(-1, index, values * weight.to(values.dtype))
+        return flat.reshape(*lead, *self.shape)
+
+    def refined(self, spacing: float | Sequence[float]) -> Grid:
+        """A grid of another spacing (m) from the same origin that covers the same box."""
+        return Grid.covering(self.origin, self.upper, spacing)
+
+    def padded(self, nodes: int) -> Grid:
+        """The same grid with `nodes` more nodes on every side (fewer where negative)."""
+        origin = tuple(start - nodes * step for start, step in zip(self.origin, self.spacing, strict=True))
+        return Grid(origin, self.spacing, tuple(count + 2 * nodes for count in self.shape))
+
+    def _corners(self, low: Tensor, high: Tensor, fraction: Tensor) -> Stencil:
+        strides = [math.prod(self.shape[self.dimension - axis :]) for axis in range(self.dimension)]
+        index, weight = [], []
+        for corner in product((0, 1), repeat=self.dimension):
+            index.append(sum((high if up else low)[..., a] * strides[a] for a, up in enumerate(corner)))
+            factors = [fraction[..., a] if up else 1 - fraction[..., a] for a, up in enumerate(corner)]
+            weight.append(torch.stack(factors).prod(dim=0))
+        return Stencil(torch.stack(index, dim=-1), torch.stack(weight, dim=-1))
+
+    def _check_points(self, points: Tensor) -> None:
+        if points.ndim < 2 or points.shape[-1] != self.dimension:
+            raise ValueError(f"Grid: points must be (..., n, {self.dimension}), not {tuple(points.shape)}")
+        if not points.is_floating_point():
+            raise ValueError(f"Grid: points must be floating point (metres), not {points.dtype}")
+
+    def _lead(self, field: Tensor) -> tuple[int, ...]:
+        if tuple(field.shape[field.ndim - self.dimension :]) != self.shape or field.ndim < self.dimension:
+            raise ValueError(
+                f"Grid.sample: the field's last axes must be {self.shape}, not {tuple(field.shape)}"
+            )
+        return tuple(field.shape[: field.ndim - self.dimension])
+
+    @staticmethod
+    def _batch(stencil: Stencil, lead: tuple[int, ...]) -> tuple[int, ...]:
+        batch = tuple(stencil.index.shape[:-2])
+        if lead[: len(batch)] != batch:
+            raise ValueError(f"Grid: points with batch {batch} do not fit leading axes {lead}")
+        return batch
+
+    @staticmethod
+    def _broadcast(part: Tensor, batch: tuple[int, ...], lead: tuple[int, ...]) -> Tensor:
+        count = part.shape[-1]
+        return part.reshape(*batch, *(1,) * (len(lead) - len(batch)), count).expand(*lead, count)
