@@ -1,29 +1,30 @@
 """Error measures of a velocity recording, each with its formula.
 
-Notation. v is the velocity under test, u the true one, both (T, D, *shape) in m/s; M is the truth's mask (the
-recording's own where there is no truth) and <.> the mean over the nodes of M in all T frames. A node of M where the
-recording has no value (not a number, weight 0, or outside its mask) counts as v = 0: a method cannot gain by leaving
-nodes out.
+Notation. v is the velocity under test, u the true one, both (T, D, *shape) in m/s; M is the truth's mask
+(the recording's own where there is no truth) and <.> the mean over the nodes of M in all T frames. A node of
+M where the recording has no value (not a number, weight 0, or outside its mask) counts as v = 0: a method
+cannot gain by leaving nodes out.
 
 | name | formula | unit |
 |---|---|---|
 | `nrmse` | sqrt(<abs(v - u)^2>) / sqrt(<abs(u)^2>) | 1 |
 | `vnrmse` | sqrt(<abs(v - u)^2>) / max abs(u) | 1 |
 | `magnitude_nrmse` | sqrt(<(abs(v) - abs(u))^2>) / sqrt(<abs(u)^2>) | 1 |
-| `direction_error_deg` | mean angle between v and u where abs(u) > 0.1 max abs(u); a zero v counts as 90 | degrees |
+| `direction_error_deg` | mean angle between v and u where abs(u) > 0.1 max abs(u); zero v: 90 | degrees |
 | `divergence_rms` | sqrt(<(div v)^2>), central differences, nodes whose 2 D neighbours lie in M | 1/s |
 | `wall_normal_rms` | sqrt(<((v - w).n)^2>) over the faces of the wall (region 0), by area | m/s |
 | `flow_rate_error` | RMS over time of (Q - Q_ref) / RMS over time of Q_ref | 1 |
 | `residual_rms` | sqrt(<W abs(v - m)^2> / <W>) against the measurement m with weights W | m/s |
 
-Q(t) is the net flow rate into the blood through all orifices (regions above 0) relative to their own motion, from v at
-the faces; Q_ref the truth's flow rates where it has them, else the dV/dt of the moving surface, which equals it for an
-incompressible fluid. At a face v is interpolated from the nodes of M around it alone (multilinear weights renormalised
-over them); a face with no such node is left out of `wall_normal_rms` and carries nothing into Q.
+Q(t) is the net flow rate into the blood through all orifices (regions above 0) relative to their own motion,
+from v at the faces; Q_ref the truth's flow rates where it has them, else the dV/dt of the moving surface,
+which equals it for an incompressible fluid. At a face v is interpolated from the nodes of M around it alone
+(multilinear weights renormalised over them); a face with no such node is left out of `wall_normal_rms` and
+carries nothing into Q.
 
-Every measure also has a value per frame: the same formula with the sums over that frame and, in the ratios, the
-denominators of the whole recording, so that quiet frames do not divide by next to nothing. A measure that is not
-defined (no face, a fluid at rest as the truth) is `None`.
+Every measure also has a value per frame: the same formula with the sums over that frame and, in the ratios,
+the denominators of the whole recording, so that quiet frames do not divide by next to nothing. A measure
+that is not defined (no face, a fluid at rest as the truth) is `None`.
 """
 
 from __future__ import annotations
@@ -31,9 +32,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-import geometry
 import numpy as np
 import torch
+
+import geometry
 
 __all__ = ["METRICS", "UNITS", "Score", "Scores", "evaluate", "matching_frames"]
 
@@ -74,7 +76,7 @@ def evaluate(
 ) -> Scores:
     """Every measure that can be had of `recording`, by name.
 
-    Without `truth` the five that need none remain out; without `measured` there is no `residual_rms`. The truth may
+    Without `truth` those that compare with it are left out, without `measured` the residual. The truth may
     have more frames than the recording, but needs one at each of its times, on the same grid (`ValueError`).
     """
     velocity, mask = filled_velocity(recording), np.asarray(recording.mask, bool)
@@ -93,7 +95,7 @@ def evaluate(
 
 
 def filled_velocity(recording: geometry.Recording) -> np.ndarray:
-    """The velocity (T, D, *shape), m/s, with 0 where the recording has no value (see the head of this module)."""
+    """The velocity (T, D, *shape), m/s, with 0 where the recording has no value."""
     known = np.asarray(recording.mask, bool)
     if recording.weight is not None:
         known = known & (np.asarray(recording.weight) > 0)
@@ -101,7 +103,7 @@ def filled_velocity(recording: geometry.Recording) -> np.ndarray:
     return np.where(known[:, None] & np.isfinite(velocity), velocity, 0)
 
 
-# --- against the truth ---------------------------------------------------------------------------------------------
+# --- against the truth ----------------------------------------------------------------------------
 
 
 def velocity_scores(velocity: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> Scores:
@@ -125,7 +127,7 @@ def _direction_score(velocity: np.ndarray, truth: np.ndarray, fast: np.ndarray) 
     sums, counts = np.zeros(len(fast)), fast.reshape(len(fast), -1).sum(1)
     for frame, chosen in enumerate(fast):
         v, u = (field[frame][:, chosen].astype(np.float64) for field in (velocity, truth))
-        # The half-angle form keeps full precision at 0 and 180 degrees, where arccos of the cosine loses half of it.
+        # The half-angle form (Kahan) is exact near 0 and 180 degrees; arccos loses half the digits.
         v_size, u_size = np.linalg.norm(v, axis=0), np.linalg.norm(u, axis=0)
         angle = 2 * np.arctan2(
             np.linalg.norm(v * u_size - u * v_size, axis=0), np.linalg.norm(v * u_size + u * v_size, axis=0)
@@ -134,7 +136,7 @@ def _direction_score(velocity: np.ndarray, truth: np.ndarray, fast: np.ndarray) 
     return Score(_ratio(sums.sum(), counts.sum()), [_ratio(s, n) for s, n in zip(sums, counts, strict=True)])
 
 
-# --- of one field --------------------------------------------------------------------------------------------------
+# --- of one field ---------------------------------------------------------------------------------
 
 
 def divergence_rms(velocity: np.ndarray, mask: np.ndarray, spacing: np.ndarray) -> Score:
@@ -176,7 +178,7 @@ def _interior(inside: np.ndarray) -> np.ndarray:
     return interior
 
 
-# --- at the wall and the orifices ----------------------------------------------------------------------------------
+# --- at the wall and the orifices -----------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -233,7 +235,7 @@ def _faces(velocity: np.ndarray, mask: np.ndarray, recording: geometry.Recording
 
 
 def outward_areas(corners: np.ndarray) -> np.ndarray:
-    """Area vectors (nf, D) of faces given by their corners (nf, D, D): triangles in space, edges in the plane."""
+    """Area vectors (nf, D) of faces given by their corners (nf, D, D): triangles, or edges in a plane."""
     if corners.shape[-1] == 2:
         along = corners[:, 1] - corners[:, 0]  # counter-clockwise around the blood: outward is to the right
         return np.stack([along[:, 1], -along[:, 0]], axis=1)
@@ -243,7 +245,7 @@ def outward_areas(corners: np.ndarray) -> np.ndarray:
 def sample_inside(
     grid: geometry.Grid, velocity: np.ndarray, mask: np.ndarray, points: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Velocity (n, D) at points (n, D) from the nodes inside the mask alone, and where there was such a node (n,).
+    """Velocity (n, D) at points (n, D) from the nodes inside the mask alone, and where there was one (n,).
 
     The zeros beyond the wall would otherwise halve every velocity at it, the true one included.
     """
@@ -256,11 +258,11 @@ def sample_inside(
     return (sampled * covered).T.numpy(), covered.numpy()
 
 
-# --- against the measurement ---------------------------------------------------------------------------------------
+# --- against the measurement ----------------------------------------------------------------------
 
 
 def residual_rms(velocity: np.ndarray, measured: geometry.Recording) -> Score:
-    """Weighted RMS distance, m/s, to the measurement where it measured; along the beam where it measured only that."""
+    """Weighted RMS distance, m/s, to the measurement where there is one; along its beam where it has one."""
     observed = np.asarray(measured.velocity)
     known = np.asarray(measured.mask, bool) & np.isfinite(observed).all(1)
     weight = np.where(known, 1.0 if measured.weight is None else np.asarray(measured.weight), 0.0)
@@ -272,7 +274,7 @@ def residual_rms(velocity: np.ndarray, measured: geometry.Recording) -> Score:
     return _rms_score((weight * square).sum(axes), weight.sum(axes), 1.0)
 
 
-# --- frames and sums -----------------------------------------------------------------------------------------------
+# --- frames and sums ------------------------------------------------------------------------------
 
 
 def matching_frames(times: np.ndarray, among: np.ndarray, what: str) -> np.ndarray:
@@ -292,11 +294,14 @@ def _on_frames_of(other: geometry.Recording, recording: geometry.Recording, what
     same = tuple(mine.shape) == tuple(its.shape) and np.allclose(mine.spacing, its.spacing, rtol=1e-6)
     if not same or not np.allclose(mine.origin, its.origin, atol=1e-3 * float(np.min(mine.spacing))):
         raise ValueError(
-            f"{what} lies on another grid (shape {tuple(its.shape)}, origin {np.asarray(its.origin)}, spacing "
-            f"{np.asarray(its.spacing)}) than the recording (shape {tuple(mine.shape)}, origin "
-            f"{np.asarray(mine.origin)}, spacing {np.asarray(mine.spacing)}); sample it onto the recording's first"
+            f"{what} lies on another grid than the recording ({_grid_text(its)}; not {_grid_text(mine)}); "
+            "sample it onto the recording's grid first"
         )
     return other.select(matching_frames(recording.time, other.time, what))
+
+
+def _grid_text(grid: geometry.Grid) -> str:
+    return f"shape {tuple(grid.shape)}, origin {tuple(grid.origin)}, spacing {tuple(grid.spacing)}"
 
 
 def _square_sums(field: np.ndarray, mask: np.ndarray) -> np.ndarray:

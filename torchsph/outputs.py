@@ -33,7 +33,7 @@ def output_folder(path: str | Path) -> Path:
 
 @contextmanager
 def staged(folder: str | Path) -> Iterator[Path]:
-    """A scratch folder whose files move into `folder` when the block ends well, and vanish when it does not."""
+    """A scratch folder whose files move into `folder` when the block ends well, and vanish otherwise."""
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     scratch = Path(tempfile.mkdtemp(prefix=".torchsph-", dir=folder))

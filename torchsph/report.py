@@ -1,7 +1,8 @@
 """The pictures that a run leaves behind: `report.png` of an assimilation, `forecast.png` of a forecast.
 
-`draw_report` shows the cut through both valves (truth where given, measurement, each analysis) at frames that share
-the motion evenly, the error over time with the times at which the valves are open, and the measures as a table.
+`draw_report` shows the cut through both valves (truth where given, measurement, each analysis) at frames that
+share the motion evenly, the error over time with the times at which the valves are open, and the measures as
+a table.
 """
 
 from __future__ import annotations
@@ -10,9 +11,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import geometry
 import matplotlib
 import numpy as np
+
+import geometry
 
 matplotlib.use("Agg")  # no screen is needed, and none is asked for
 from matplotlib import pyplot as plt  # noqa: E402
@@ -71,7 +73,7 @@ def draw_report(
 
 
 def characteristic_frames(recording: geometry.Recording, count: int = COLUMNS) -> np.ndarray:
-    """Frames that cut the recording's motion (RMS speed summed over time) into equal shares, in order, no repeats."""
+    """Frames that share the recording's motion (RMS speed summed over time) evenly: in order, no repeats."""
     velocity = filled_velocity(recording).reshape(len(recording.time), -1)
     motion = np.sqrt(np.mean(velocity.astype(np.float64) ** 2, axis=1))
     share = np.cumsum(motion + 1e-12)
@@ -103,7 +105,13 @@ def _cuts_of(recording: geometry.Recording, plane: slices.Plane, pixel: float) -
 def _draw_cut(axis: matplotlib.axes.Axes, picture: slices.Cut, top: float, arrows: float):
     mm = 1e3
     image = axis.pcolormesh(
-        mm * picture.across, mm * picture.along, picture.speed, cmap="viridis", vmin=0, vmax=top, rasterized=True
+        mm * picture.across,
+        mm * picture.along,
+        picture.speed,
+        cmap="viridis",
+        vmin=0,
+        vmax=top,
+        rasterized=True,
     )
     step = max(1, round(arrows / float(picture.across[1] - picture.across[0])))
     thin = (slice(step // 2, None, step),) * 2
@@ -142,7 +150,9 @@ def _draw_curves(
     axis.legend(fontsize=8, loc="upper left")
 
 
-def _draw_table(axis: matplotlib.axes.Axes, scores: Mapping[str, Scores], seconds: Mapping[str, float]) -> None:
+def _draw_table(
+    axis: matplotlib.axes.Axes, scores: Mapping[str, Scores], seconds: Mapping[str, float]
+) -> None:
     heading, *rows = scores_table(scores, seconds)
     axis.axis("off")
     table = axis.table([row[1:] for row in rows], rowLabels=[row[0] for row in rows], colLabels=heading[1:],

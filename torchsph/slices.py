@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import geometry
 import numpy as np
 import trimesh
 
+import geometry
 from torchsph.metrics import sample_inside
 
 __all__ = ["Cut", "Plane", "cut", "valve_plane"]
@@ -46,10 +46,14 @@ def valve_plane(recording: geometry.Recording) -> Plane:
         origin, across, along = _long_axis_plane(recording, points)
     s, t = (points - origin) @ across, (points - origin) @ along
     margin = 0.02 * max(np.ptp(s), np.ptp(t))
-    return Plane(origin, across, along, (s.min() - margin, s.max() + margin, t.min() - margin, t.max() + margin))
+    return Plane(
+        origin, across, along, (s.min() - margin, s.max() + margin, t.min() - margin, t.max() + margin)
+    )
 
 
-def _long_axis_plane(recording: geometry.Recording, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _long_axis_plane(
+    recording: geometry.Recording, points: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     corners = np.asarray(recording.wall.at(0), float)[np.asarray(recording.wall.faces)]
     region = np.asarray(recording.wall.region)
     centres = [corners[region == label].mean((0, 1)) for label in np.unique(region[region > 0])[:2]]
@@ -94,7 +98,7 @@ def _outline(recording: geometry.Recording, frame: int, plane: Plane) -> np.ndar
 
 
 def _enclosed(points: np.ndarray, segments: np.ndarray) -> np.ndarray:
-    """Even-odd rule: whether a ray from each point (n, 2) crosses the segments (m, 2, 2) an odd number of times."""
+    """Even-odd rule: points (n, 2) whose ray crosses the segments (m, 2, 2) an odd number of times."""
     odd = np.zeros(len(points), bool)
     x, y = points[:, 0], points[:, 1]
     for (x0, y0), (x1, y1) in segments:

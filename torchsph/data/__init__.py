@@ -8,7 +8,7 @@ _HERE = Path(__file__).resolve().parent
 
 
 def sample_measurement() -> Path:
-    """The measured recording of the sample: 10 ms frames from late ejection to the peak of the filling jet."""
+    """The measured recording of the sample: 10 ms frames from late ejection to the filling jet."""
     return _HERE / "sample_measured.h5"
 
 
