@@ -199,7 +199,7 @@ def _passed_power(axial_velocity: Tensor, options: NoiseModel) -> Tensor:
 
 def _confidence(passed: Tensor, growth: Tensor, patchy: Tensor, scatter: Tensor) -> Tensor:
     """Stand-in for the speckle correlation: power passed, decorrelation by shear, and mostly chance."""
-    mean = 0.5 + 0.3 * passed - 0.01 * (growth - 1)
+    mean = 0.46 + 0.36 * passed - 0.01 * (growth - 1)
     return (mean + 0.12 * patchy + 0.12 * scatter).clamp(WEIGHT_FLOOR, 1.0)
 
 
@@ -210,13 +210,4 @@ def _as_measurement(
         f"measurement by a noise model, lateral {options.lateral:g}, axial {options.axial:g} m/s, "
         f"outliers {options.outliers:g}, every {options.every}, seed {seed}"
     )
-    return replace(
-        true.select(frames),
-        velocity=velocity,
-        weight=weight,
-        sigma=None,
-        uncovered=None,
-        beam=None,
-        pressure=None,
-        description=description,
-    )
+    return replace(true.select(frames).with_velocity(velocity, description=description), weight=weight)
