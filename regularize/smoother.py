@@ -1,0 +1,130 @@
+"""The penalised B-spline smoother: options, presets, and the fit of one velocity field.
+
+The cost (options in physical units, ``scaling="density"``) is a sum of averages,
+
+    J(v) = <|v - v_i|^2>_samples + divergence^2 <(div v)^2>_fluid + wall^2 <(n.(v - v_w))^2>_walls
+           + no_slip^2 <|v - v_w|^2>_walls + curvature^4 <|grad grad v|^2>_fluid + damping^2 <|v|^2>_fluid,
+
+so that no number changes its meaning with the grid, the number of samples or the size of the box: wall,
+no_slip and damping are ratios, divergence and curvature lengths (curvature halves wavelengths of
+2 pi curvature). Averages over samples are weighted by weight^(2 power), ones over walls by WallRows.weight.
+``scaling="thesis"`` is eq. 3.22 with sums, derivatives per mean knot spacing and divergence rows at the
+samples (ERRATA 3.17, 3.23), the meaning that table 4.1 needs.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from math import prod
+
+import torch
+
+from .bspline import DEGREES
+from .direct import solve_direct
+from .errors import InvalidInput
+from .field import SplineField
+from .krylov import lsqr
+from .rows import FitData, build_system, knots_for
+from .walls import WallRows
+
+SOLVERS = ("auto", "direct", "lsqr")
+SCALINGS = ("density", "thesis")
+
+
+@dataclass(frozen=True)
+class Smoother:
+    """Options of the spline fit; ``None`` switches a part off. See the module's text for the units.
+
+    ``knots``: knot distance in m (or one per axis); ``nodes`` instead fixes the coefficients per axis,
+    longest side first (table 4.1: 32, 16, 16). ``power``: samples' rows are multiplied by weight ** power.
+    ``tolerance``: true relative gradient at which a solver may stop; NotConverged otherwise.
+    """
+
+    knots: float | tuple[float, ...] | None = 3e-3
+    nodes: tuple[int, ...] | None = None
+    degree: int = 3
+    divergence: float | None = 30e-3
+    wall: float | None = 2.0
+    no_slip: float | None = 0.5
+    curvature: float | None = 1.5e-3
+    damping: float | None = 1e-3
+    power: float = 1.0
+    scaling: str = "density"
+    solver: str = "auto"
+    tolerance: float = 1e-6
+    max_iterations: int = 5000
+
+    def __post_init__(self) -> None:
+        if (self.knots is None) == (self.nodes is None):
+            raise InvalidInput("give exactly one of knots (a distance in m) and nodes (a count per axis)")
+        if self.degree not in DEGREES:
+            raise InvalidInput(f"degree is {self.degree}: it must be one of {DEGREES}")
+        for name in ("divergence", "wall", "no_slip", "curvature", "damping"):
+            value = getattr(self, name)
+            if value is not None and not 0 <= value < float("inf"):
+                raise InvalidInput(f"{name} is {value}: it must be finite and >= 0, or None to switch it off")
+        if self.power < 0:
+            raise InvalidInput(f"power is {self.power}: it must be >= 0")
+        if self.solver not in SOLVERS:
+            raise InvalidInput(f"solver is {self.solver!r}: choose one of {SOLVERS}")
+        if self.scaling not in SCALINGS:
+            raise InvalidInput(f"scaling is {self.scaling!r}: choose one of {SCALINGS}")
+        if self.tolerance <= 0 or self.max_iterations < 1:
+            raise InvalidInput("tolerance must be > 0 and max_iterations >= 1")
+        if self.nodes is not None and min(self.nodes) <= self.degree:
+            raise InvalidInput(f"nodes is {self.nodes}: each axis needs more than degree = {self.degree}")
+
+    @classmethod
+    def preset(cls, name: str, **changes: object) -> "Smoother":
+        """``default``, or ``thesis``: table 4.1 (32x16x16, damping 0.5, lambda 500, kappa 200, power 2)."""
+        if name == "default":
+            return replace(cls(), **changes)
+        if name == "thesis":
+            table = cls(
+                knots=None,
+                nodes=(32, 16, 16),
+                divergence=500.0,
+                wall=200.0,
+                no_slip=None,
+                curvature=None,
+                damping=0.5,
+                power=2.0,
+                scaling="thesis",
+            )
+            return replace(table, **changes)
+        raise InvalidInput(f"preset is {name!r}: choose 'default' or 'thesis'")
+
+    def fit(
+        self,
+        points: torch.Tensor,
+        velocity: torch.Tensor,
+        weight: torch.Tensor | None = None,
+        wall: WallRows | None = None,
+        *,
+        divergence_points: torch.Tensor | None = None,
+        box: tuple[Sequence[float], Sequence[float]] | None = None,
+    ) -> SplineField:
+        """Fit samples velocity (n, D) in m/s at points (n, D) in m with confidences weight (n,) in [0, 1].
+
+        ``wall``: rows on walls and valves. ``divergence_points`` (m, D): where the divergence is penalised
+        (and the field counts as supported); absent: over every knot cell that holds samples or wall.
+        ``box``: lower and upper corner of the knot grid (default: around all points). Samples of zero weight
+        are ignored and may be NaN. Raises InvalidInput for bad input, NotConverged when the solver fails.
+        """
+        data = FitData.checked(points, velocity, weight, wall, divergence_points, box, self.power)
+        knots = knots_for(data, self.knots, self.nodes, self.degree)
+        system = build_system(self, knots, data)
+        if self.solver == "lsqr":
+            solution = lsqr(
+                system.matvec,
+                system.rmatvec,
+                system.target(),
+                damping=system.damping,
+                tolerance=self.tolerance,
+                max_iterations=self.max_iterations,
+            )
+        else:
+            solution, _ = solve_direct(system, tolerance=self.tolerance)
+        coefficients = solution.x.to(data.velocity).view(knots.nodes, -1).T.reshape(-1, *knots.shape)
+        covered = torch.zeros(prod(knots.cells), dtype=torch.bool)
+        covered[system.cells()] = True
+        return SplineField(knots, coefficients, covered, solution, data.left_out)
