@@ -243,7 +243,7 @@ def _device(name: str) -> str:
 
 def _check_spacing(spacing: float | None, recording: geometry.Recording) -> None:
     """A spacing in millimetres is the likeliest slip: it leaves no room for a particle."""
-    vertices = np.asarray(recording.wall.at(0))
+    vertices = recording.wall.at(0).vertices
     narrowest = float(np.ptp(vertices, axis=0).min())
     if spacing is not None and spacing > narrowest / 3:
         raise ValueError(

@@ -216,30 +216,17 @@ def flow_rate_error(velocity: np.ndarray, mask: np.ndarray, recording: geometry.
 
 def _faces(velocity: np.ndarray, mask: np.ndarray, recording: geometry.Recording) -> Iterator[_Faces]:
     motion = geometry.WallMotion.from_recording(recording)
-    corners = np.asarray(recording.wall.faces)
-    region = np.asarray(recording.wall.region)
     for frame, time in enumerate(recording.time):
-        vertices = np.asarray(recording.wall.at(frame), float)
-        vector = outward_areas(vertices[corners])
-        wall_velocity = np.asarray(motion.velocity(float(time)), float)[corners].mean(1)
-        fluid, covered = sample_inside(
-            recording.grid, velocity[frame], mask[frame], vertices[corners].mean(1)
-        )
+        surface = recording.wall.at(frame)
+        wall_velocity = np.asarray(motion.velocity(float(time)), np.float64)[surface.faces].mean(1)
+        fluid, covered = sample_inside(recording.grid, velocity[frame], mask[frame], surface.centroids)
         yield _Faces(
-            region=region,
-            area=np.linalg.norm(vector, axis=1),
-            relative_flow=np.einsum("fd,fd->f", fluid - wall_velocity, vector),
-            swept=np.einsum("fd,fd->f", wall_velocity, vector),
+            region=surface.region,
+            area=surface.areas,
+            relative_flow=np.einsum("fd,fd->f", fluid - wall_velocity, surface.area_vectors),
+            swept=np.einsum("fd,fd->f", wall_velocity, surface.area_vectors),
             covered=covered,
         )
-
-
-def outward_areas(corners: np.ndarray) -> np.ndarray:
-    """Area vectors (nf, D) of faces given by their corners (nf, D, D): triangles, or edges in a plane."""
-    if corners.shape[-1] == 2:
-        along = corners[:, 1] - corners[:, 0]  # counter-clockwise around the blood: outward is to the right
-        return np.stack([along[:, 1], -along[:, 0]], axis=1)
-    return 0.5 * np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
 
 
 def sample_inside(

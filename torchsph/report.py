@@ -25,7 +25,7 @@ from torchsph.metrics import UNITS, Scores, filled_velocity, matching_frames  # 
 
 __all__ = ["characteristic_frames", "draw_forecast", "draw_report", "scores_table"]
 
-COLUMNS = 4
+COLUMNS = 5
 COLOURS = ("0.45", "tab:blue", "tab:orange", "tab:green", "tab:red", "tab:purple")
 HEADINGS = {
     "nrmse": "nrmse",
@@ -62,9 +62,9 @@ def draw_report(
         named = {"truth": truth, **named}
     frames = characteristic_frames(measured if truth is None else truth)
     rows = [Row(name, recording.select(frames)) for name, recording in named.items()]
-    height = 2.6 * len(rows) + 4.2
-    figure = plt.figure(figsize=(11, height), layout="constrained")
-    pictures, curves, table = figure.subfigures(3, 1, height_ratios=[2.6 * len(rows), 2.6, 1.6])
+    heights = [2.3 * len(rows), 2.5, 0.6 + 0.25 * len(scores)]
+    figure = plt.figure(figsize=(9, sum(heights)), layout="constrained")
+    pictures, curves, table = figure.subfigures(3, 1, height_ratios=heights)
     _draw_cuts(pictures, rows, slices.valve_plane(measured))
     _draw_curves(curves.subplots(), measured, truth, scores)
     _draw_table(table.subplots(), scores, seconds or {})
@@ -84,7 +84,7 @@ def characteristic_frames(recording: geometry.Recording, count: int = COLUMNS) -
 def _draw_cuts(figure: matplotlib.figure.SubFigure, rows: Sequence[Row], plane: slices.Plane) -> None:
     step, times = float(min(rows[0].recording.grid.spacing)), rows[0].recording.time
     axes = figure.subplots(len(rows), len(times), squeeze=False, sharex=True, sharey=True)
-    cuts = [_cuts_of(row.recording, plane, 0.4 * step) for row in rows]
+    cuts = [_cuts_of(row.recording, plane, 0.25 * step) for row in rows]
     # The first row is the truth where there is one: outliers of the measurement must not set the colours.
     top = max(float(np.nanmax(c.speed, initial=1e-6)) for c in cuts[0])
     for row, line, row_cuts in zip(rows, axes, cuts, strict=True):
@@ -118,9 +118,9 @@ def _draw_cut(axis: matplotlib.axes.Axes, picture: slices.Cut, top: float, arrow
     s, t = np.meshgrid(mm * picture.across, mm * picture.along)
     axis.quiver(
         s[thin], t[thin], picture.velocity[0][thin], picture.velocity[1][thin],
-        color="white", angles="xy", scale=12 * top, width=0.006,
+        color="white", angles="xy", scale=8 * top, width=0.006,
     )  # fmt: skip
-    axis.add_collection(LineCollection(mm * picture.outline, colors="0.2", linewidths=0.8))
+    axis.add_collection(LineCollection(mm * picture.outline, colors="0.2", linewidths=1.0))
     axis.set_aspect("equal")
     axis.tick_params(labelsize=7)
     return image
@@ -147,7 +147,7 @@ def _draw_curves(
                       transform=axis.get_xaxis_transform(), fontsize=8, color="0.4")  # fmt: skip
     axis.set(xlabel="time, ms", ylabel=label, ylim=(0, None))
     axis.grid(alpha=0.3)
-    axis.legend(fontsize=8, loc="upper left")
+    axis.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
 
 
 def _draw_table(

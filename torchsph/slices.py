@@ -39,7 +39,7 @@ def valve_plane(recording: geometry.Recording) -> Plane:
 
     With fewer than two orifices the principal axes of the surface serve; a plane recording is its own plane.
     """
-    points = np.concatenate([np.asarray(recording.wall.at(f), float) for f in range(len(recording.time))])
+    points = recording.wall.vertices.reshape(-1, recording.dimension)
     if recording.dimension == 2:
         origin, across, along = np.zeros(2), np.array([1.0, 0.0]), np.array([0.0, 1.0])
     else:
@@ -54,9 +54,9 @@ def valve_plane(recording: geometry.Recording) -> Plane:
 def _long_axis_plane(
     recording: geometry.Recording, points: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    corners = np.asarray(recording.wall.at(0), float)[np.asarray(recording.wall.faces)]
-    region = np.asarray(recording.wall.region)
-    centres = [corners[region == label].mean((0, 1)) for label in np.unique(region[region > 0])[:2]]
+    surface = recording.wall.at(0)
+    labels = np.unique(surface.region[surface.region > 0])[:2]
+    centres = [surface.centroids[surface.part(label)].mean(0) for label in labels]
     body = points.mean(0)
     principal = np.linalg.svd(points[:: max(1, len(points) // 5000)] - body, full_matrices=False)[2]
     across, upward = principal[1], principal[0]
@@ -68,7 +68,8 @@ def _long_axis_plane(
     upward = upward - (upward @ across) * across
     if np.linalg.norm(upward) < 1e-9:
         upward = principal[0] - (principal[0] @ across) * across
-    origin = np.mean(centres, axis=0) if centres else body
+    # Off the mesh's own symmetry plane by a hair: a plane through vertices cuts triangles in degenerate ways.
+    origin = (np.mean(centres, axis=0) if centres else body) + 1e-7 * np.cross(across, upward)
     return origin, across, upward / np.linalg.norm(upward)
 
 
@@ -87,12 +88,12 @@ def cut(recording: geometry.Recording, velocity: np.ndarray, frame: int, plane: 
 
 
 def _outline(recording: geometry.Recording, frame: int, plane: Plane) -> np.ndarray:
-    vertices, faces = np.asarray(recording.wall.at(frame), float), np.asarray(recording.wall.faces)
+    surface = recording.wall.at(frame)
     if recording.dimension == 2:
-        segments = vertices[faces]
+        segments = surface.vertices[surface.faces]
     else:
-        mesh = trimesh.Trimesh(vertices, faces, process=False)
-        segments = trimesh.intersections.mesh_plane(mesh, np.cross(plane.across, plane.along), plane.origin)
+        normal = np.cross(plane.across, plane.along)
+        segments = trimesh.intersections.mesh_plane(surface.trimesh(), normal, plane.origin)
     relative = np.asarray(segments).reshape(-1, 2, len(plane.origin)) - plane.origin
     return np.stack([relative @ plane.across, relative @ plane.along], axis=-1)
 
