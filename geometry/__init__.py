@@ -1,6 +1,10 @@
 """Recordings, regular grids, closed surfaces and their signed distance, moving walls, ventricle shapes."""
 
+from .closest import Closest, SurfaceIndex
+from .distance import GridDistance, distance_and_closest, signed_distance
 from .grid import Grid, Stencil
+from .motion import WallMotion
+from .moving_distance import MovingDistance, WallField, WallPoint
 from .recording import Recording, Wall
 from .recording_read import read_recording
 from .recording_rules import RecordingError
@@ -9,15 +13,24 @@ from .surface import Surface, SurfaceError
 from .winding import grid_winding, winding_number
 
 __all__ = [
+    "Closest",
     "Grid",
+    "GridDistance",
+    "MovingDistance",
     "Recording",
     "RecordingError",
     "Stencil",
     "Surface",
     "SurfaceError",
+    "SurfaceIndex",
     "Wall",
+    "WallField",
+    "WallMotion",
+    "WallPoint",
+    "distance_and_closest",
     "grid_winding",
     "read_recording",
+    "signed_distance",
     "winding_number",
     "write_recording",
 ]

@@ -1,8 +1,8 @@
-"""A regular grid: where its nodes are, multilinear sampling at points, and the exact adjoint of that sampling.
+"""A regular grid: its nodes, multilinear sampling at points, and the exact adjoint of that sampling.
 
-Grid arrays are indexed `[..., z, y, x]` (`[..., y, x]` in a plane) and a value sits AT its node; points hold their
-coordinates in the order x, y, z. Everything is linear in the field, differentiable by torch in field and points, and
-runs in the dtype and on the device of what it is given.
+Grid arrays are indexed `[..., z, y, x]` (`[..., y, x]` in a plane) and a value sits AT its node; points hold
+their coordinates in the order x, y, z. Everything is linear in the field, differentiable by torch in field
+and points, and runs in the dtype and on the device of what it is given.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ class Stencil(NamedTuple):
 class Grid:
     """Nodes at `origin + spacing * (i, j, k)`.
 
-    `origin` and `spacing` are metres in the order x, y, z; `shape` is in array order (nz, ny, nx). Raises ValueError
-    where they disagree in length, a spacing is not positive or an axis has no node.
+    `origin` and `spacing` are metres in the order x, y, z; `shape` is in array order (nz, ny, nx). Raises
+    ValueError where they disagree in length, a spacing is not positive or an axis has no node.
     """
 
     origin: tuple[float, ...]
@@ -58,7 +58,7 @@ class Grid:
     def covering(
         cls, lower: Sequence[float], upper: Sequence[float], spacing: float | Sequence[float]
     ) -> Grid:
-        """The smallest grid of this spacing (m) that starts at `lower` and reaches `upper` (both D numbers, m)."""
+        """The smallest grid of this spacing (m) from `lower` that reaches `upper` (D numbers each, m)."""
         steps = (spacing,) * len(lower) if isinstance(spacing, (int, float)) else tuple(spacing)
         if not all(step > 0 for step in steps):
             raise ValueError(f"Grid.covering: spacing must be positive, not {spacing}")
@@ -114,7 +114,7 @@ class Grid:
         return (points - points.new_tensor(self.origin)) / points.new_tensor(self.spacing)
 
     def contains(self, points: Tensor, *, margin: float = 0.0) -> Tensor:
-        """Whether points `(*batch, n, D)` lie in the box of the nodes, grown by `margin` (m): bool `(*batch, n)`."""
+        """Whether points `(*batch, n, D)` lie in the box grown by `margin` (m): bool `(*batch, n)`."""
         self._check_points(points)
         lower = points.new_tensor(self.origin) - margin
         upper = points.new_tensor(self.upper) + margin
@@ -123,8 +123,9 @@ class Grid:
     def stencil(self, points: Tensor, *, outside: str = "clamp") -> Stencil:
         """The nodes and weights that interpolate multilinearly at points `(*batch, n, D)`.
 
-        Outside the box, `clamp` takes the value at the nearest point of the box and `zero` gives weights of zero.
-        A stencil can be kept and passed to `sample` and `spread` for as long as the points stay where they are.
+        Outside the box, `clamp` takes the value at the nearest point of the box and `zero` gives weights of
+        zero. A stencil can be kept and passed to `sample` and `spread` for as long as the points stay where
+        they are.
         """
         if outside not in OUTSIDE:
             raise ValueError(f"Grid.stencil: outside must be one of {OUTSIDE}, not {outside!r}")
@@ -143,8 +144,9 @@ class Grid:
     def sample(self, field: Tensor, points: Tensor | Stencil, *, outside: str = "clamp") -> Tensor:
         """Multilinear interpolation of `field (*lead, *shape)` at points: `(*lead, n)`.
 
-        `points` is `(n, D)` in metres, shared by all leading axes, or `(*batch, n, D)` where `batch` are the first
-        leading axes of the field; or the `Stencil` of such points. Raises ValueError where the shapes do not fit.
+        `points` is `(n, D)` in metres, shared by all leading axes, or `(*batch, n, D)` where `batch` are the
+        first leading axes of the field; or the `Stencil` of such points. Raises ValueError where the shapes
+        do not fit.
         """
         lead = self._lead(field)
         stencil = points if isinstance(points, Stencil) else self.stencil(points, outside=outside)
@@ -158,7 +160,7 @@ class Grid:
         return result
 
     def spread(self, values: Tensor, points: Tensor | Stencil, *, outside: str = "clamp") -> Tensor:
-        """The exact adjoint of `sample`: add `values (*lead, n)` to the nodes around the points: `(*lead, *shape)`.
+        """The exact adjoint of `sample`: add `values (*lead, n)` to nodes around the points, `(*lead, *shape)`.
 
         `<spread(a), b> = <a, sample(b)>` for every a and b. No division by the cell volume takes place.
         """

@@ -1,7 +1,8 @@
 """A recording: velocity volumes on a regular grid over time, with the walls and valves around the blood.
 
-Truths, measurements, forecasts and analyses are all recordings. In memory as in the file, grid arrays are indexed
-`[time, component, z, y, x]`, components in the order x, y, z, all in SI units; a plane recording drops the z axis.
+Truths, measurements, forecasts and analyses are all recordings. In memory as in the file, grid arrays are
+indexed `[time, component, z, y, x]`, components in the order x, y, z, all in SI units; a plane recording
+drops the z axis.
 """
 
 from __future__ import annotations
@@ -42,8 +43,9 @@ REQUIRED = ("/time", "/velocity", "/mask", "/wall/vertices", "/wall/faces", "/wa
 class Wall:
     """The closed surface around the blood at every frame, same faces throughout.
 
-    `vertices` `(T, nv, D)` or, at rest, `(nv, D)`, m; `faces` `(nf, D)`, outward; `region` `(nf,)`: 0 wall, 1 mitral
-    inlet, 2 aortic outlet, further ones free; `velocity` `(T, nv, D)`, m/s, or None, then it follows from `vertices`.
+    `vertices` `(T, nv, D)` or, at rest, `(nv, D)`, m; `faces` `(nf, D)`, outward; `region` `(nf,)`: 0 wall, 1
+    mitral inlet, 2 aortic outlet, further ones free; `velocity` `(T, nv, D)`, m/s, or None, then it follows
+    from `vertices`.
     """
 
     vertices: np.ndarray
@@ -75,11 +77,11 @@ class Wall:
 class Recording:
     """Velocity volumes with their walls and valves; `None` stands for an optional dataset that is not there.
 
-    `time` (T,) s; `velocity` (T, D, *shape) m/s; `mask` (T, *shape) bool, one mask `shape` is repeated for every frame;
-    `rho` kg/m^3; `mu` Pa s; `period` s, 0 = not periodic; `weight` (T, *shape) in [0, 1]; `sigma` (T, D, *shape) m/s;
-    `uncovered` (T,) nodes; `beam` (T, D, *shape) or (D, *shape) unit vectors; `pressure` (T, *shape) Pa;
-    `valve_intervals` (n, 3) rows (region, opens, closes), s; `valve_open` (T, 2); `volume` (T,) m^3;
-    `flux_mitral`, `flux_aortic` (T,) m^3/s, positive into the ventricle.
+    `time` (T,) s; `velocity` (T, D, *shape) m/s; `mask` (T, *shape) bool, one mask `shape` is repeated for
+    every frame; `rho` kg/m^3; `mu` Pa s; `period` s, 0 = not periodic; `weight` (T, *shape) in [0, 1];
+    `sigma` (T, D, *shape) m/s; `uncovered` (T,) nodes; `beam` (T, D, *shape) or (D, *shape) unit vectors;
+    `pressure` (T, *shape) Pa; `valve_intervals` (n, 3) rows (region, opens, closes), s; `valve_open` (T, 2);
+    `volume` (T,) m^3; `flux_mitral`, `flux_aortic` (T,) m^3/s, positive into the ventricle.
 
     Raises RecordingError where shapes disagree; `check` tests every rule of the format.
     """
@@ -132,7 +134,7 @@ class Recording:
         return found
 
     def check(self, source: str = "recording") -> None:
-        """Raise RecordingError for the first rule of the format that is broken; `source` opens the message."""
+        """Raise RecordingError for the first rule of the format that is broken; `source` opens its message."""
         check(self, source)
 
     def select(self, frames: slice | Sequence[int] | np.ndarray) -> Recording:
@@ -159,7 +161,7 @@ class Recording:
         uncovered: np.ndarray | None = None,
         description: str | None = None,
     ) -> Recording:
-        """Another velocity (T, D, *shape), m/s, on the same times, grid, mask, walls and valves: an analysis or a forecast.
+        """Another velocity (T, D, *shape), m/s, between the same walls: an analysis or a forecast.
 
         What belonged to the old velocity (weight, sigma, beam, pressure, fluxes) is dropped.
         """
@@ -170,9 +172,9 @@ class Recording:
     def valve_intervals_or_derived(self) -> np.ndarray:
         """Rows (region, opens, closes), `(n, 3)`, s: `/valve/intervals`, or else derived from `/valve_open`.
 
-        A change seen between two frames took place midway between them; a valve that is open at the first frame opens
-        at -inf, one open at the last frame closes at +inf, because the recording does not say when. No rows where the
-        recording has neither.
+        A change seen between two frames took place midway between them; a valve that is open at the first
+        frame opens at -inf, one open at the last frame closes at +inf, because the recording does not say
+        when. No rows where the recording has neither.
         """
         if self.valve_intervals is not None:
             return self.valve_intervals

@@ -1,4 +1,4 @@
-"""Reading a recording file: only what the format names is touched, and nothing outside the file is ever followed."""
+"""Reading a recording file: only what the format names, and never anything outside the file."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ from .recording import LAYOUT, REQUIRED, Recording, Wall
 from .recording_rules import RecordingError
 
 ELSEWHERE = "in another file, which is never followed; copy the data into this file"
-# HDF5 filter numbers: deflate (gzip), shuffle, fletcher32 and lzf. Others would load code from plug-ins on the machine.
+# HDF5 filter numbers: deflate (gzip), shuffle, fletcher32 and lzf. Others would load code from plug-ins on
+# the machine.
 FILTERS = {1, 2, 3, 32000}
 SOFT_LINKS = 16  # a chain longer than this is a circle
 
@@ -20,9 +21,9 @@ SOFT_LINKS = 16  # a chain longer than this is a circle
 def read_recording(path: str | Path) -> Recording:
     """Read and validate a recording file.
 
-    Raises FileNotFoundError where there is no file, and RecordingError, which names the file, the dataset, the rule
-    and what to do, where it is not a recording or breaks one of the rules. External links, external storage and
-    virtual datasets are refused. The velocity comes back as 0 outside the mask.
+    Raises FileNotFoundError where there is no file, and RecordingError, which names the file, the dataset,
+    the rule and what to do, where it is not a recording or breaks one of the rules. External links, external
+    storage and virtual datasets are refused. The velocity comes back as 0 outside the mask.
     """
     path = Path(path)
     if not path.is_file():

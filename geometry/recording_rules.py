@@ -26,7 +26,7 @@ class RecordingError(ValueError):
 
 
 def check(recording: Recording, source: str = "recording") -> None:
-    """Raise RecordingError for the first rule that the recording breaks; `source` (a file) opens the message."""
+    """Raise RecordingError for the first rule that is broken; `source`, such as the file, opens the message."""
     check_shapes(recording, source)
     for rule in (
         _constants,
@@ -54,12 +54,12 @@ def check_shapes(recording: Recording, source: str = "recording") -> None:
     for dataset, shapes in allowed_shapes(recording).items():
         if dataset in arrays and arrays[dataset].shape not in shapes:
             wanted = " or ".join(str(shape) for shape in shapes)
-            rule = f"has the shape {arrays[dataset].shape}, but must be {wanted} to agree with the other datasets"
+            rule = f"has the shape {arrays[dataset].shape}, but others in the recording ask for {wanted}"
             raise RecordingError(source, dataset, rule)
 
 
 def allowed_shapes(recording: Recording) -> dict[str, tuple[tuple[int, ...], ...]]:
-    """The shapes that each dataset may have, given the frames, the grid and the numbers of vertices and faces."""
+    """The shapes that each dataset may have, given the frames, the grid and the size of the wall."""
     frames, dimension, shape = recording.time.shape[0], recording.grid.dimension, recording.grid.shape
     wall, intervals = recording.wall, recording.valve_intervals
     points = (wall.vertices.shape[-2] if wall.vertices.ndim in (2, 3) else 0, dimension)
@@ -85,7 +85,7 @@ def allowed_shapes(recording: Recording) -> dict[str, tuple[tuple[int, ...], ...
 
 
 def measured_nodes(recording: Recording) -> np.ndarray:
-    """Nodes `(T, *shape)` that carry a value: inside the mask and, where there is a weight, with a weight above 0."""
+    """Nodes `(T, *shape)` that carry a value: inside the mask and not of weight 0."""
     return recording.mask if recording.weight is None else recording.mask & (recording.weight > 0)
 
 
@@ -109,7 +109,7 @@ def _time(recording: Recording, source: str) -> None:
     falling = np.diff(time) <= 0
     if falling.any():
         frame = int(np.argmax(falling))
-        rule = f"must increase strictly, but {time[frame]:g} s is followed by {time[frame + 1]:g} s at frame {frame + 1}"
+        rule = f"must increase strictly, but {time[frame]:g} s at frame {frame} is followed by {time[frame + 1]:g} s"
         raise RecordingError(source, "/time", f"{rule}; sort the frames and drop repeated ones")
 
 
@@ -131,7 +131,9 @@ def _finite(recording: Recording, source: str) -> None:
         finite = np.isfinite(field) if dataset == "/pressure" else np.isfinite(field).all(axis=components)
         bad = measured & ~finite
         if bad.any():
-            rule = f"must be finite inside the mask, but {int(bad.sum())} nodes are not, the first at {_first(bad)}"
+            rule = (
+                f"must be finite inside the mask, but is not at {int(bad.sum())} nodes, as at {_first(bad)}"
+            )
             raise RecordingError(source, dataset, f"{rule}; take them out of /mask or give them /weight 0")
 
 
@@ -178,7 +180,8 @@ def _wall(recording: Recording, source: str) -> None:
         first.check()
     except SurfaceError as fault:
         raise RecordingError(source, "/wall/faces", str(fault)) from fault
-    # Closedness is a matter of the faces alone; only the orientation has to be looked at again in later frames.
+    # Closedness is a matter of the faces alone; only the orientation has to be looked at again in later
+    # frames.
     sense = np.sign(first.component_volumes)
     for frame in range(1, recording.frames if wall.moves else 1):
         surface = Surface(wall.vertices[frame], wall.faces, wall.region)

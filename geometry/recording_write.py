@@ -15,10 +15,10 @@ from .recording import Recording
 def write_recording(path: str | Path, recording: Recording) -> None:
     """Write a recording file that every reader of the format accepts, replacing a file of that name.
 
-    The file is written under another name in the same directory, flushed to the disk and then renamed, so that
-    whoever looks sees the old file or the new one, never a part. Raises RecordingError before anything is written
-    where the recording breaks a rule, FileNotFoundError where the directory does not exist, OSError where the disk is
-    full. The velocity is stored as 0 outside the mask.
+    The file is written under another name in the same directory, flushed to the disk and then renamed, so
+    that whoever looks sees the old file or the new one, never a part. Raises RecordingError before anything
+    is written where the recording breaks a rule, FileNotFoundError where the directory does not exist,
+    OSError where the disk is full. The velocity is stored as 0 outside the mask.
     """
     path = Path(path)
     recording.check(str(path))
@@ -73,7 +73,7 @@ def _flush(name: str) -> None:
 
 
 def _umask() -> int:
-    """The process's file mode mask; mkstemp ignores it, but the finished file should be as readable as any other."""
+    """The process's file mode mask: mkstemp ignores it, but the file should be as readable as any other."""
     current = os.umask(0)
     os.umask(current)
     return current

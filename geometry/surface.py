@@ -1,6 +1,7 @@
 """A closed surface around the blood: triangles in space, or the edges of closed polylines in a plane.
 
-Faces are numbered so that their normals point outwards, away from the blood (counter-clockwise around it in a plane).
+Faces are numbered so that their normals point outwards, away from the blood (counter-clockwise around it in a
+plane).
 """
 
 from __future__ import annotations
@@ -25,11 +26,12 @@ class SurfaceError(ValueError):
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """Vertices `(nv, D)` in metres, faces `(nf, D)` of vertex numbers, and a region label `(nf,)` for each face.
+    """Vertices `(nv, D)`, m, faces `(nf, D)` of vertex numbers, and a region label `(nf,)` for each face.
 
     Region 0 is wall, 1 the mitral inlet, 2 the aortic outlet; further labels are free. D is 2 or 3. Raises
-    SurfaceError for shapes that do not fit, vertices that are not finite and face indices out of range. Closedness and
-    orientation are not required to build one: `check` does that, `repaired` (see `repair`) mends.
+    SurfaceError for shapes that do not fit, vertices that are not finite and face indices out of range.
+    Closedness and orientation are not required to build one: `check` does that, `repaired` (see `repair`)
+    mends.
     """
 
     vertices: np.ndarray
@@ -107,7 +109,8 @@ class Surface:
     def vertex_normals(self) -> np.ndarray:
         """Outward unit normals at the vertices, `(nv, D)`: face normals weighted by the angle at the vertex.
 
-        Independent of how the faces around a vertex are cut (Thuermer and Wuethrich 1998). Zero at unused vertices.
+        Independent of how the faces around a vertex are cut (Thuermer and Wuethrich 1998). Zero at unused
+        vertices.
         """
         total = np.zeros_like(self.vertices)
         for corner, angle in enumerate(self._angles()):
@@ -144,7 +147,7 @@ class Surface:
 
     @cached_property
     def twisted_ridges(self) -> int:
-        """Number of edges where the number of faces is even but neighbours are not numbered in the same sense."""
+        """Number of edges with an even number of faces that are not numbered in the same sense."""
         balance, count = self._ridges()
         return int(((balance != 0) & (count % 2 == 0)).sum())
 
@@ -161,7 +164,7 @@ class Surface:
             text = f"the surface is not closed: {self.open_ridges} {ridges} bound a hole or an unmerged seam"
             raise SurfaceError(text + cure)
         if self.twisted_ridges:
-            text = f"the surface is not closed consistently: faces on both sides of {self.twisted_ridges} {ridges} "
+            text = f"the surface is not closed consistently: faces beside {self.twisted_ridges} {ridges} "
             raise SurfaceError(text + "are numbered in opposite senses" + cure)
         wrong = self.reversed_components()
         if wrong.any():
@@ -170,7 +173,7 @@ class Surface:
             raise SurfaceError(text + cure)
 
     def reversed_components(self) -> np.ndarray:
-        """Which connected pieces are inside out, bool: a piece must be positive, and negative inside another one."""
+        """Which connected pieces are inside out: all must be positive, but negative inside another one."""
         volumes, label = self.component_volumes, self.component_labels
         if len(volumes) == 1:
             return volumes <= 0
@@ -191,7 +194,7 @@ class Surface:
         return np.flatnonzero(self.region == region)
 
     def trimesh(self) -> trimesh.Trimesh:
-        """The same triangles as a trimesh object (3-D only), vertex order kept, regions as the face attribute."""
+        """The same triangles as a trimesh object (3-D only), vertices in order, regions as face attribute."""
         import trimesh
 
         if self.dimension != 3:

@@ -1,9 +1,9 @@
 """How often a closed surface winds around a point: 1 inside, 0 outside, 2 where two sheets of it overlap.
 
-Two ways: for scattered points the sum of solid angles, which also gives a fair fraction for a surface with holes
-(Jacobson, Kavan and Sorkine-Hornung 2013, "Robust inside-outside segmentation using generalized winding numbers",
-eq. 5), and for all nodes of a grid the signed crossings of the grid's lines, which costs next to nothing.
-Neither needs normals, so both hold for surfaces that touch or cut themselves.
+Two ways: for scattered points the sum of solid angles, which also gives a fair fraction for a surface with
+holes (Jacobson, Kavan and Sorkine-Hornung 2013, "Robust inside-outside segmentation using generalized winding
+numbers", eq. 5), and for all nodes of a grid the signed crossings of the grid's lines, which costs next to
+nothing. Neither needs normals, so both hold for surfaces that touch or cut themselves.
 """
 
 from __future__ import annotations
@@ -45,10 +45,10 @@ def _solid_angle(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
 def grid_winding(grid: Grid, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Winding number at every node of a grid: int32 `shape`.
 
-    Along each grid line in the last coordinate direction the surface is crossed where the line pierces a face; a face
-    that is left outwards counts +1 for all nodes before it. The lines are moved aside by 1e-7 of the spacing, so that
-    they do not meet the vertices and edges of meshes that sit on the nodes; nodes closer to the surface than that may
-    fall on either side.
+    Along each grid line in the last coordinate direction the surface is crossed where the line pierces a
+    face; a face that is left outwards counts +1 for all nodes before it. The lines are moved aside by 1e-7 of
+    the spacing, so that they do not meet the vertices and edges of meshes that sit on the nodes; nodes closer
+    to the surface than that may fall on either side.
     """
     dimension = grid.dimension
     lateral = (
@@ -61,7 +61,8 @@ def grid_winding(grid: Grid, vertices: np.ndarray, faces: np.ndarray) -> np.ndar
     crossing = _segment_crossings if dimension == 2 else _triangle_crossings
     counts = tuple(reversed(grid.shape[1:]))
     line, height, sign = crossing(place, vertices[:, -1], faces, counts)
-    # A crossing at height z concerns the nodes below it: count it on the last such node and sum upwards down the line.
+    # A crossing at height z concerns the nodes below it: count it on the last such node and sum upwards down
+    # the line.
     level = np.ceil((height - grid.origin[-1]) / grid.spacing[-1]).astype(np.int64) - 1
     hit = level >= 0
     level = np.minimum(level, grid.shape[0] - 1)
@@ -72,14 +73,15 @@ def grid_winding(grid: Grid, vertices: np.ndarray, faces: np.ndarray) -> np.ndar
 
 
 def _segment_crossings(place, height, faces, counts):
-    """Grid lines crossed by each segment of a closed polyline: flat line number, height, sign (+1 leaving the inside)."""
+    """Grid lines crossed by each segment: line number, height, sign (+1 where the line leaves the inside)."""
     start, end = place[faces[:, 0], 0], place[faces[:, 1], 0]
     first = np.maximum(np.ceil(np.minimum(start, end)), 0).astype(np.int64)
     stop = np.minimum(np.ceil(np.maximum(start, end)), counts[0]).astype(np.int64)
     segment, line = _ranges(first, stop)
     fraction = (line - start[segment]) / (end - start)[segment]
     h0, h1 = height[faces[segment, 0]], height[faces[segment, 1]]
-    # Counter-clockwise around the inside: an upper side runs towards -x, and there the line leaves the inside.
+    # Counter-clockwise around the inside: an upper side runs towards -x, and there the line leaves the
+    # inside.
     return line, h0 + fraction * (h1 - h0), np.sign(start - end)[segment]
 
 
@@ -106,8 +108,8 @@ def _triangle_crossings(place, height, faces, counts):
 def _edge(place, a, b, at):
     """Twice the signed area of (a, b, at), evaluated with the smaller vertex first.
 
-    The two triangles that share an edge then get the same number with opposite sign, bit for bit, so that a line
-    that passes close to the edge, or through it, is counted by exactly one of them.
+    The two triangles that share an edge then get the same number with opposite sign, bit for bit, so that a
+    line that passes close to the edge, or through it, is counted by exactly one of them.
     """
     flip = a > b
     p, q = place[np.where(flip, b, a)], place[np.where(flip, a, b)]

@@ -1,0 +1,136 @@
+"""Signed distance, normal and velocity of a moving wall at any point and time: one look-up per particle.
+
+Grids are made at key frames and are linear in time between them (the thesis's two textures, section 3.1.2).
+Each holds, for every node, the distance (positive inside), its gradient (unit normal INTO the fluid) and the
+velocity of the closest wall point; a blend for the current time is sampled multilinearly.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from .distance import distance_and_closest
+from .grid import Grid
+from .motion import WallMotion
+
+
+class WallPoint(NamedTuple):
+    """The wall seen from points: distance (m) `(n,)`, unit normal into the fluid and velocity (m/s) `(n, D)`."""
+
+    distance: Tensor
+    normal: Tensor
+    velocity: Tensor
+
+
+@dataclass(frozen=True)
+class WallField:
+    """The wall at one time on a grid: `table` `(1 + 2 D, *shape)` of distance, normal and wall velocity."""
+
+    grid: Grid
+    table: Tensor
+
+    def at(self, points: Tensor) -> WallPoint:
+        """Distance, normal and wall velocity at points `(n, D)`, m; off the grid those of its nearest point."""
+        dimension = self.grid.dimension
+        values = self.grid.sample(self.table, points)
+        normal = torch.nn.functional.normalize(values[1 : 1 + dimension].T, dim=-1, eps=1e-12)
+        return WallPoint(values[0], normal, values[1 + dimension :].T)
+
+    def distance(self, points: Tensor) -> Tensor:
+        """Signed distance (m) at points `(n, D)`: `(n,)`, positive inside."""
+        return self.grid.sample(self.table[0], points)
+
+
+class MovingDistance:
+    """The signed distance grid of a moving wall.
+
+    `grid`: where the distance is kept; it must cover the wall at all times, with a margin of a few nodes if
+    particles may leave. `band` (m): where it is exact (see `signed_distance`); `travel`: where a vertex moves
+    by more than that many spacings between two key frames, grids are added between them; `keep`: how many
+    grids are held in memory.
+    """
+
+    def __init__(
+        self,
+        grid: Grid,
+        motion: WallMotion,
+        *,
+        band: float | None = None,
+        travel: float = 1.0,
+        keep: int = 8,
+        dtype: torch.dtype = torch.float32,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        if grid.dimension != motion.dimension:
+            raise ValueError(f"MovingDistance: a {motion.dimension}-D wall on a {grid.dimension}-D grid")
+        if not travel > 0 or keep < 2:
+            raise ValueError(f"MovingDistance: travel must be > 0 and keep >= 2, not {travel} and {keep}")
+        self.grid, self.motion, self.band, self.keep = grid, motion, band, keep
+        self.dtype, self.device = dtype, torch.device(device)
+        self._pieces = [1] * max(len(motion.time) - 1, 1)
+        if motion.moves:
+            limit = travel * min(grid.spacing)
+            ways = [motion.travel(key) for key in range(len(self._pieces))]
+            self._pieces = [max(1, int(np.ceil(way / limit))) for way in ways]
+        self._tables: OrderedDict[tuple[int, int], Tensor] = OrderedDict()
+        self._current: tuple[float, WallField] | None = None
+
+    def at(self, t: float) -> WallField:
+        """The wall's field at time `t` (s). The last one is remembered."""
+        if self._current is None or self._current[0] != t:
+            self._current = (t, WallField(self.grid, self._blend(t)))
+        return self._current[1]
+
+    def distance(self, points: Tensor, t: float) -> Tensor:
+        """Signed distance (m) of points `(n, D)` at time `t`: `(n,)`, positive inside."""
+        return self.at(t).distance(points)
+
+    def normal(self, points: Tensor, t: float) -> Tensor:
+        """Unit normal into the fluid, the gradient of the distance, at points `(n, D)`: `(n, D)`."""
+        return self.at(t).at(points).normal
+
+    def wall_velocity(self, points: Tensor, t: float) -> Tensor:
+        """Velocity (m/s) of the closest wall point, `(n, D)`."""
+        return self.at(t).at(points).velocity
+
+    def _blend(self, t: float) -> Tensor:
+        key, place, _ = self.motion.locate(t)
+        if not self.motion.moves:
+            return self._table(0, 0)
+        scaled = place * self._pieces[key]
+        piece = min(int(scaled), self._pieces[key] - 1)
+        return torch.lerp(self._table(key, piece), self._table(key, piece + 1), scaled - piece)
+
+    def _table(self, key: int, piece: int) -> Tensor:
+        if self.motion.moves and piece == self._pieces[key]:
+            key, piece = key + 1, 0
+        name = (key, piece)
+        if name in self._tables:
+            self._tables.move_to_end(name)
+            return self._tables[name]
+        time = float(self.motion.time[key])
+        if piece:
+            time += piece / self._pieces[key] * float(self.motion.time[key + 1] - self.motion.time[key])
+        self._tables[name] = self._make(time)
+        while len(self._tables) > self.keep:
+            self._tables.popitem(last=False)
+        return self._tables[name]
+
+    def _make(self, time: float) -> Tensor:
+        surface = self.motion.surface(time)
+        distance, closest = distance_and_closest(self.grid, surface, band=self.band)
+        velocity = closest.interpolate(surface, self.motion.velocity(time))
+        # On the surface itself the direction to the closest point is lost in round-off; the face's normal is
+        # right there.
+        towards = self.grid.nodes().numpy() - closest.point(surface)
+        flat = distance.reshape(-1, 1)
+        close = np.abs(flat) < 1e-3 * min(self.grid.spacing)
+        normal = np.where(close, -surface.normals[closest.face], towards / np.where(close, 1.0, flat))
+        rows = np.concatenate([flat, normal, velocity], axis=1).T.reshape(-1, *self.grid.shape)
+        return torch.as_tensor(rows, dtype=self.dtype, device=self.device)
