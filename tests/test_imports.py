@@ -21,7 +21,18 @@ THIRD_PARTY = {
     "regularize": {"numpy", "scipy", "torch"},
     "torchsph": {"numpy", "scipy", "trimesh", "h5py", "torch", "tqdm", "matplotlib", "triton"},
 }
-SIMULATOR = ("simulator", "integrate", "terms", "walls", "transfer", "seeding", "scene", "schemes", "pairs", "particles")
+SIMULATOR = (
+    "simulator",
+    "integrate",
+    "terms",
+    "walls",
+    "transfer",
+    "seeding",
+    "scene",
+    "schemes",
+    "pairs",
+    "particles",
+)
 
 
 def modules(package: str) -> list[Path]:
@@ -46,7 +57,9 @@ def test_resolving_relative_imports(tmp_path, monkeypatch):
     monkeypatch.setattr("test_imports.ROOT", tmp_path)
     file = tmp_path / "torchsph" / "pairs" / "one.py"
     file.parent.mkdir(parents=True)
-    file.write_text("from ..walls import a\nfrom . import b\nimport numpy.linalg\nfrom geometry import Grid\n")
+    file.write_text(
+        "from ..walls import a\nfrom . import b\nimport numpy.linalg\nfrom geometry import Grid\n"
+    )
     assert imported(file) >= {"torchsph.walls", "torchsph.pairs.b", "numpy.linalg", "geometry.Grid"}
 
 
@@ -77,18 +90,31 @@ def test_every_dependency_is_declared(package):
 
 def test_the_simulator_never_sees_a_measurement():
     """No part of the engine knows the filters or the ultrasound: no inverse crime by construction."""
-    engine = [p for p in modules("torchsph") if set(p.relative_to(ROOT).with_suffix("").parts) & set(SIMULATOR)]
+    engine = [
+        p for p in modules("torchsph") if set(p.relative_to(ROOT).with_suffix("").parts) & set(SIMULATOR)
+    ]
     offences = {
         f"{path.name} imports {name}"
         for path in engine
         for name in imported(path)
-        if name.startswith(("torchsph.assimilation", "torchsph.ultrasound", "torchsph.pipeline", "torchsph.metrics"))
+        if name.startswith(
+            ("torchsph.assimilation", "torchsph.ultrasound", "torchsph.pipeline", "torchsph.metrics")
+        )
     }
     assert engine and not offences
 
 
 def test_the_top_level_holds_only_what_the_design_names():
-    named = {"geometry", "regularize", "torchsph", "tests", "examples", "pyproject.toml", "README.md", "LICENSE"}
+    named = {
+        "geometry",
+        "regularize",
+        "torchsph",
+        "tests",
+        "examples",
+        "pyproject.toml",
+        "README.md",
+        "LICENSE",
+    }
     made_by_tools = {"build", "dist", "torchsph.egg-info", "torchsph-out", "venv", "shared"}
     found = {path.name for path in ROOT.iterdir() if not path.name.startswith(".")} - made_by_tools
     assert found <= named

@@ -35,7 +35,9 @@ def test_ci_runs_the_test_command_of_the_readme():
 def test_the_project_file_defines_what_the_commands_need():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     assert project["scripts"]["torchsph"] == "torchsph.cli:main"
-    assert {"pytest", "hypothesis"} <= {re.split(r"\W", need)[0] for need in project["optional-dependencies"]["test"]}
+    assert {"pytest", "hypothesis"} <= {
+        re.split(r"\W", need)[0] for need in project["optional-dependencies"]["test"]
+    }
 
 
 def test_commands_of_the_table_are_those_of_the_program():
@@ -60,7 +62,10 @@ def test_the_example_runs(tmp_path, monkeypatch):
     (example,) = blocks("python")
     assert len([line for line in example.splitlines() if line.strip()]) <= 9
     for printed, quick in (
-        ("read_recording(sample_measurement())", "read_recording(sample_measurement()).select(slice(11, 13))"),
+        (
+            "read_recording(sample_measurement())",
+            "read_recording(sample_measurement()).select(slice(11, 13))",
+        ),
         ("spacing=1.5e-3", "spacing=3e-3"),
         ("members=12", "members=3"),
     ):
