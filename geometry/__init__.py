@@ -9,10 +9,13 @@ from .recording import Recording, Wall
 from .recording_read import read_recording
 from .recording_rules import RecordingError
 from .recording_write import write_recording
+from .shapes import box, ellipse, ellipsoid, polygon, revolved, tube
 from .surface import Surface, SurfaceError
+from .ventricle import Beat, Ventricle
 from .winding import grid_winding, winding_number
 
 __all__ = [
+    "Beat",
     "Closest",
     "Grid",
     "GridDistance",
@@ -23,14 +26,21 @@ __all__ = [
     "Surface",
     "SurfaceError",
     "SurfaceIndex",
+    "Ventricle",
     "Wall",
     "WallField",
     "WallMotion",
     "WallPoint",
+    "box",
     "distance_and_closest",
+    "ellipse",
+    "ellipsoid",
     "grid_winding",
+    "polygon",
     "read_recording",
+    "revolved",
     "signed_distance",
+    "tube",
     "winding_number",
     "write_recording",
 ]

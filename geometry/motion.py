@@ -69,7 +69,7 @@ class WallMotion:
 
     @classmethod
     def through(cls, time, vertices, faces, region, *, rates=None, period: float = 0.0) -> WallMotion:
-        """The motion through key frames `vertices` (K, nv, D), m, with `rates` (m/s) or differences of them."""
+        """The motion through key `vertices` (K, nv, D), m, with `rates` (m/s) or differences of them."""
         time, vertices = np.asarray(time, np.float64), np.asarray(vertices, np.float64)
         if rates is None:
             rates = _differences(time, vertices, period)
@@ -131,7 +131,7 @@ class WallMotion:
         return float(np.sqrt((step * step).sum(axis=1)).max())
 
     def locate(self, t: float) -> tuple[int, float, float]:
-        """Key interval of a time, place in it in [0, 1], its length (s); ValueError outside the key frames."""
+        """Key interval of a time, place in it in [0, 1], its length (s); ValueError off the key frames."""
         if not math.isfinite(t):
             raise ValueError(f"WallMotion: time must be finite, not {t}")
         if not self.moves:

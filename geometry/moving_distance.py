@@ -21,7 +21,7 @@ from .motion import WallMotion
 
 
 class WallPoint(NamedTuple):
-    """The wall seen from points: distance (m) `(n,)`, unit normal into the fluid and velocity (m/s) `(n, D)`."""
+    """The wall seen from points: distance (m) `(n,)`, unit normal into the fluid, velocity (m/s) `(n, D)`."""
 
     distance: Tensor
     normal: Tensor
@@ -36,7 +36,7 @@ class WallField:
     table: Tensor
 
     def at(self, points: Tensor) -> WallPoint:
-        """Distance, normal and wall velocity at points `(n, D)`, m; off the grid those of its nearest point."""
+        """Distance, normal and wall velocity at points `(n, D)`, m; off the grid its nearest values."""
         dimension = self.grid.dimension
         values = self.grid.sample(self.table, points)
         normal = torch.nn.functional.normalize(values[1 : 1 + dimension].T, dim=-1, eps=1e-12)

@@ -134,7 +134,7 @@ class Recording:
         return found
 
     def check(self, source: str = "recording") -> None:
-        """Raise RecordingError for the first rule of the format that is broken; `source` opens its message."""
+        """Raise RecordingError for the first rule of the format that is broken; `source` opens the text."""
         check(self, source)
 
     def select(self, frames: slice | Sequence[int] | np.ndarray) -> Recording:

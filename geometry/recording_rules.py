@@ -26,7 +26,7 @@ class RecordingError(ValueError):
 
 
 def check(recording: Recording, source: str = "recording") -> None:
-    """Raise RecordingError for the first rule that is broken; `source`, such as the file, opens the message."""
+    """Raise RecordingError for the first rule that is broken; `source`, say the file, opens the message."""
     check_shapes(recording, source)
     for rule in (
         _constants,
@@ -109,7 +109,9 @@ def _time(recording: Recording, source: str) -> None:
     falling = np.diff(time) <= 0
     if falling.any():
         frame = int(np.argmax(falling))
-        rule = f"must increase strictly, but {time[frame]:g} s at frame {frame} is followed by {time[frame + 1]:g} s"
+        rule = (
+            f"must increase strictly, but frame {frame} at {time[frame]:g} s precedes {time[frame + 1]:g} s"
+        )
         raise RecordingError(source, "/time", f"{rule}; sort the frames and drop repeated ones")
 
 

@@ -1,0 +1,146 @@
+"""Closed surfaces of simple bodies, triangulated at a chosen spacing: bodies of revolution, boxes, plane outlines.
+
+The vertices lie on the body, so that the volume of the mesh converges to the body's with the square of the
+spacing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from .surface import Surface, SurfaceError
+
+
+def ellipsoid(
+    semi_axes: Sequence[float], spacing: float, centre: Sequence[float] = (0.0, 0.0, 0.0)
+) -> Surface:
+    """An ellipsoid with three semi-axes (m) along x, y, z around `centre`; `spacing` (m) is that of its vertices."""
+    axes = _positive("ellipsoid: semi_axes", semi_axes, 3)
+    _positive("ellipsoid: spacing", [spacing], 1)
+    steps = max(3, round(np.pi * float(axes.max()) / spacing))
+    angle = np.linspace(0, np.pi, steps + 1)
+    unit = revolved(np.stack([np.sin(angle), np.cos(angle)], axis=1), spacing / float(axes.max()))
+    return unit.moved(unit.vertices * axes + np.asarray(centre, np.float64))
+
+
+def tube(radius: float, length: float, spacing: float) -> Surface:
+    """A straight pipe along z from 0 to `length` (m): wall (region 0), inlet at z = 0 (1), outlet at the end (2)."""
+    _positive("tube: radius, length, spacing", [radius, length, spacing], 3)
+    across, along = max(1, round(radius / spacing)), max(1, round(length / spacing))
+    r = np.concatenate(
+        [np.linspace(0, radius, across + 1), np.full(along - 1, radius), np.linspace(radius, 0, across + 1)]
+    )
+    z = np.concatenate([np.zeros(across), np.linspace(0, length, along + 1), np.full(across, length)])
+    region = np.repeat([1, 0, 2], [across, along, across])
+    return revolved(np.stack([r, z], axis=1), spacing, region)
+
+
+def box(lower: Sequence[float], upper: Sequence[float], spacing: float) -> Surface:
+    """A box between two corners (m), its sides cut into triangles of about `spacing`; one region, the wall."""
+    lower, upper = np.asarray(lower, np.float64), np.asarray(upper, np.float64)
+    size = _positive("box: upper - lower", upper - lower, 3)
+    _positive("box: spacing", [spacing], 1)
+    count = np.maximum(np.rint(size / spacing), 1).astype(np.int64)
+    points, faces = [], []
+    for axis in range(3):
+        u, v = (axis + 1) % 3, (axis + 2) % 3
+        i, j = (a.ravel() for a in np.meshgrid(np.arange(count[u]), np.arange(count[v]), indexing="ij"))
+        for side in (0, 1):
+            start = sum(len(part) for part in points)
+            lattice = np.zeros(((count[u] + 1) * (count[v] + 1), 3), np.int64)
+            lattice[:, axis] = side * count[axis]
+            lattice[:, u], lattice[:, v] = np.divmod(np.arange(len(lattice)), count[v] + 1)
+            a = start + i * (count[v] + 1) + j
+            quads = np.stack([a, a + count[v] + 1, a + count[v] + 2, a + 1], axis=1)
+            quads = quads if side else quads[:, ::-1]
+            points.append(lattice)
+            faces.append(quads[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3))
+    # The sides were made one by one; integer lattice coordinates tell exactly which of their vertices
+    # coincide.
+    lattice, place = np.unique(np.concatenate(points), axis=0, return_inverse=True)
+    return Surface(lower + lattice / count * size, place.reshape(-1)[np.concatenate(faces)])
+
+
+def ellipse(semi_axes: Sequence[float], spacing: float, centre: Sequence[float] = (0.0, 0.0)) -> Surface:
+    """An ellipse in the plane, semi-axes (m) along x and y, as a closed polyline."""
+    axes = _positive("ellipse: semi_axes", semi_axes, 2)
+    return polygon(ellipse_rim(axes, spacing) + np.asarray(centre, np.float64), np.inf)
+
+
+def polygon(corners: np.ndarray, spacing: float) -> Surface:
+    """A closed polyline through `corners (n, 2)`, m, counter-clockwise, its sides cut into edges of about `spacing`."""
+    corners = np.asarray(corners, np.float64)
+    if corners.ndim != 2 or corners.shape[1] != 2 or len(corners) < 3:
+        raise SurfaceError(f"polygon: corners must be (n, 2) with n >= 3, not {corners.shape}")
+    sides = np.roll(corners, -1, axis=0) - corners
+    count = np.maximum(np.rint(np.linalg.norm(sides, axis=1) / spacing), 1).astype(np.int64)
+    pieces = [c + np.arange(n)[:, None] / n * s for c, s, n in zip(corners, sides, count, strict=True)]
+    points = np.concatenate(pieces)
+    number = np.arange(len(points))
+    surface = Surface(points, np.stack([number, np.roll(number, -1)], axis=1))
+    surface.check()
+    return surface
+
+
+def ellipse_rim(semi_axes: Sequence[float], spacing: float) -> np.ndarray:
+    """Points on an ellipse, evenly along its length about `spacing` apart, counter-clockwise: `(n, 2)`, m."""
+    fine = np.linspace(0, 2 * np.pi, 2001)
+    points = np.stack([semi_axes[0] * np.cos(fine), semi_axes[1] * np.sin(fine)], axis=1)
+    length = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    count = max(8, round(length[-1] / spacing))
+    angle = np.interp(np.arange(count) / count * length[-1], length, fine)
+    return np.stack([semi_axes[0] * np.cos(angle), semi_axes[1] * np.sin(angle)], axis=1)
+
+
+def revolved(profile: np.ndarray, spacing: float, region: np.ndarray | int = 0) -> Surface:
+    """The body whose outline `profile (n, 2)` of (radius, z), m, starts and ends on the axis, turned around z.
+
+    Every profile point becomes a ring of vertices about `spacing` apart; `region` labels the n - 1 bands
+    between them.
+    """
+    profile = np.asarray(profile, np.float64)
+    if profile.ndim != 2 or profile.shape[1] != 2 or len(profile) < 3:
+        raise SurfaceError(f"revolved: profile must be (n, 2) with n >= 3, not {profile.shape}")
+    if np.abs(profile[[0, -1], 0]).max() > 1e-9 * profile[:, 0].max() or (profile[1:-1, 0] <= 0).any():
+        raise SurfaceError("revolved: the profile must start and end on the axis and stay off it between")
+    rings = [ring_of(radius, z, spacing) for radius, z in profile[1:-1]]
+    rings = [np.array([[0, 0, profile[0, 1]]]), *rings, np.array([[0, 0, profile[-1, 1]]])]
+    first = np.concatenate([[0], np.cumsum([len(ring) for ring in rings])])
+    bands = [
+        stitched(first[k], len(rings[k]), first[k + 1], len(rings[k + 1])) for k in range(len(rings) - 1)
+    ]
+    labels = np.repeat(np.broadcast_to(region, len(bands)), [len(band) for band in bands])
+    surface = Surface(np.concatenate(rings), np.concatenate(bands), labels)
+    return surface if surface.volume > 0 else Surface(surface.vertices, surface.faces[:, ::-1], labels)
+
+
+def ring_of(radius: float, z: float, spacing: float) -> np.ndarray:
+    """Vertices evenly on a circle around z, at least six: `(n, 3)`, m."""
+    count = max(6, round(2 * np.pi * radius / spacing))
+    angle = 2 * np.pi * np.arange(count) / count
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle), np.full(count, z)], axis=1)
+
+
+def stitched(first: int, count: int, second: int, other: int) -> np.ndarray:
+    """Triangles between two rings of `count` and `other` vertices numbered from `first` and `second`; 1 is a pole."""
+    faces, i, j = [], 0, 0
+    ends = (count if count > 1 else 0, other if other > 1 else 0)
+    while i < ends[0] or j < ends[1]:
+        a, b = first + i % count, second + j % other
+        # Step on the ring that lags behind in angle, seen from the middle of its next edge.
+        if j >= ends[1] or (i < ends[0] and (i + 0.5) * other <= (j + 0.5) * count):
+            faces.append((a, first + (i + 1) % count, b))
+            i += 1
+        else:
+            faces.append((a, second + (j + 1) % other, b))
+            j += 1
+    return np.array(faces)
+
+
+def _positive(name: str, values: Sequence[float], count: int) -> np.ndarray:
+    array = np.asarray(values, np.float64)
+    if array.shape != (count,) or not (np.isfinite(array) & (array > 0)).all():
+        raise SurfaceError(f"{name} must be {count} positive lengths (m), not {values}")
+    return array
