@@ -4,7 +4,7 @@ Knows numpy, scipy and torch only; walls come in as arrays (:class:`WallRows`).
 """
 
 from .bspline import basis
-from .direct import Factor, solve_direct
+from .direct import Factor, PreparedSystem, solve_direct
 from .errors import InvalidInput, NotConverged
 from .field import SplineField
 from .knots import Knots
@@ -21,6 +21,7 @@ __all__ = [
     "InvalidInput",
     "Knots",
     "NotConverged",
+    "PreparedSystem",
     "Smoother",
     "Solution",
     "SplineField",

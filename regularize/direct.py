@@ -1,70 +1,112 @@
 """Direct solution: banded Cholesky of the normal matrix with float64 refinement on the rows themselves."""
 
-import numpy as np
 import torch
 from scipy.linalg import LinAlgError, cho_solve_banded, cholesky_banded
 
-from .assembly import Ordering, normal_band, order
+from . import native
+from .assembly import reference_band
 from .errors import InvalidInput, NotConverged
 from .krylov import Solution
 from .operators import System
+from .ordering import Ordering, order
+
+
+class PreparedSystem:
+    """A system in solve order with its normal matrix and gradient, compiled or in torch.
+
+    Vectors are (active coefficients, C) in solve order. ``engine`` "native" or "reference"; None picks the
+    compiled one where it was built.
+    """
+
+    def __init__(self, system: System, ordering: Ordering | None = None, engine: str | None = None) -> None:
+        self.system = system
+        self.ordering = order(system) if ordering is None else ordering
+        if engine == "native" and not native.available():
+            raise InvalidInput("engine is 'native' but no compiled library was built; use 'reference'")
+        self.engine = engine or ("native" if native.available() else "reference")
+        self._packed = native.PackedSystem(system, self.ordering) if self.engine == "native" else None
+
+    def band(self) -> torch.Tensor:
+        """Lower band (unknowns, width) of the normal matrix, float64."""
+        return reference_band(self.system, self.ordering) if self._packed is None else self._packed.band()
+
+    def gradient(self, x: torch.Tensor | None = None) -> torch.Tensor:
+        """A'(b - A x) - damping^2 x, or A'b."""
+        if self._packed is not None:
+            return self._packed.gradient(x)
+        if x is None:
+            return self._take(self.system.right_side())
+        return self._take(self.system.gradient(self.expand(x).flatten()))
+
+    def expand(self, x: torch.Tensor) -> torch.Tensor:
+        """(active, C) in solve order -> (nodes, C) with zeros at untouched coefficients."""
+        full = torch.zeros(self.system.knots.nodes, *x.shape[1:], dtype=x.dtype)
+        full[self.ordering.nodes] = x
+        return full
+
+    def _take(self, full: torch.Tensor) -> torch.Tensor:
+        return full.view(self.system.knots.nodes, self.system.components)[self.ordering.nodes]
 
 
 class Factor:
-    """Cholesky factor of a system's normal matrix; reusable for any right-hand side of the same rows."""
+    """Cholesky factor of a normal matrix; serves any right-hand sides of the same rows and weights."""
 
-    def __init__(self, system: System, ordering: Ordering | None = None) -> None:
-        self.ordering = order(system) if ordering is None else ordering
-        self.components, self.unknowns = system.components, system.unknowns
-        band = normal_band(system, self.ordering)
+    def __init__(self, prepared: PreparedSystem) -> None:
+        self.ordering = prepared.ordering
+        band = prepared.band().numpy()
         try:
-            self._factor = cholesky_banded(band.T, overwrite_ab=True, lower=True, check_finite=False)
+            self.band = cholesky_banded(band.T, overwrite_ab=True, lower=True, check_finite=False)
         except LinAlgError as error:
             raise InvalidInput(
-                "the normal matrix is not positive definite: some coefficients are fixed by no "
-                "row; give a curvature or damping above 0"
+                "the normal matrix is not positive definite: some coefficients are fixed by no row; give a "
+                "curvature or damping above 0"
             ) from error
 
     def solve(self, right: torch.Tensor) -> torch.Tensor:
-        """(unknowns,) or (unknowns, k) -> the same shape, float64; untouched coefficients are 0."""
-        c = self.components
-        full = right.double().reshape(self.unknowns // c, -1)
-        active = full[self.ordering.nodes].reshape(len(self.ordering.nodes) * c, -1)
-        solved = cho_solve_banded((self._factor, True), active.numpy(), check_finite=False)
-        out = torch.zeros_like(full)
-        out[self.ordering.nodes] = torch.from_numpy(np.ascontiguousarray(solved)).view(len(active) // c, -1)
-        return out.view(right.shape)
+        """(active, C) or (active, C, k) in solve order -> the same shape."""
+        flat = right.double().reshape(right.shape[0] * right.shape[1], *right.shape[2:])
+        solved = cho_solve_banded((self.band, True), flat.numpy(), check_finite=False)
+        return torch.from_numpy(solved).view(right.shape)
+
+    def log_determinant(self) -> float:
+        """Natural logarithm of the determinant of the normal matrix."""
+        return 2.0 * float(torch.from_numpy(self.band[0]).log().sum())
 
 
 def solve_direct(
-    system: System,
+    system: System | PreparedSystem,
     *,
     factor: Factor | None = None,
     tolerance: float = 1e-6,
     refinements: int = 3,
     strict: bool = True,
 ) -> tuple[Solution, Factor]:
-    """Solve by Cholesky and refine until the true relative gradient is below ``tolerance``."""
-    factor = Factor(system) if factor is None else factor
-    right = system.right_side()
+    """Solve by Cholesky and refine until the true relative gradient is below ``tolerance``.
+
+    ``Solution.x`` is (nodes * C,) over all coefficients of the knot grid. A given ``factor`` (of the same
+    rows, or of similar ones) is used instead of a new one. Raises NotConverged unless ``strict`` is False.
+    """
+    prepared = system if isinstance(system, PreparedSystem) else PreparedSystem(system)
+    factor = Factor(prepared) if factor is None else factor
+    right = prepared.gradient()
     scale = float(right.norm())
     if scale == 0:
-        return Solution(torch.zeros_like(right), 0.0, 0, "zero right-hand side", "direct"), factor
+        x = prepared.expand(torch.zeros_like(right)).flatten()
+        return Solution(x, 0.0, 0, "zero right-hand side", "direct"), factor
     x = factor.solve(right)
     for count in range(1, refinements + 2):
-        gradient = system.gradient(x)
+        gradient = prepared.gradient(x)
         relative = float(gradient.norm()) / scale
         if relative <= tolerance or count == refinements + 1:
             break
         x = x + factor.solve(gradient)
-    solution = Solution(x, relative, count, "gradient below tolerance", "direct")
-    if relative > tolerance:
-        solution = Solution(x, relative, count, "refinement stalled", "direct")
-        if strict:
-            raise NotConverged(
-                f"direct solve: true relative gradient {relative:.2e} after {count - 1} "
-                f"refinements, asked for {tolerance:.1e}; the system is nearly singular: raise "
-                "curvature or damping, or lower divergence and wall",
-                solution,
-            )
+    reason = "gradient below tolerance" if relative <= tolerance else "refinement stalled"
+    solution = Solution(prepared.expand(x).flatten(), relative, count, reason, "direct")
+    if relative > tolerance and strict:
+        raise NotConverged(
+            f"direct solve: true relative gradient {relative:.2e} after {count - 1} refinements, asked for "
+            f"{tolerance:.1e}; the system is nearly singular: raise curvature or damping, or lower "
+            "divergence and wall",
+            solution,
+        )
     return solution, factor

@@ -1,15 +1,85 @@
-"""The assembled normal matrix and its solution against dense algebra."""
+"""The assembled normal matrix and its solution against dense algebra, compiled and in torch."""
+
+import shutil
 
 import pytest
 import torch
 from regularize_cases import blocks_of, make
 
-from regularize import Factor, InvalidInput, Knots, System, VectorRows, lsqr, solve_direct
+from regularize import (
+    Factor,
+    InvalidInput,
+    Knots,
+    PreparedSystem,
+    System,
+    VectorRows,
+    lsqr,
+    native,
+    native_build,
+    solve_direct,
+)
+
+ENGINES = [
+    "reference",
+    pytest.param("native", marks=pytest.mark.skipif(not native.available(), reason="not compiled")),
+]
 
 
 def dense_of(system):
     eye = torch.eye(system.unknowns, dtype=torch.float64)
     return torch.stack([system.matvec(column) for column in eye], dim=1)
+
+
+def full(band):
+    """Symmetric dense matrix of a lower band."""
+    size, width = band.shape
+    dense = torch.zeros(size, size, dtype=torch.float64)
+    for offset in range(min(size, width)):
+        dense += torch.diag(band[: size - offset, offset], -offset)
+    return dense + torch.tril(dense, -1).T
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("axes,degree", [(2, 1), (2, 3), (2, 5), (3, 1), (3, 2), (3, 3)])
+def test_band_and_gradient_equal_dense_products(axes, degree, engine):
+    knots, blocks = blocks_of(axes, degree)
+    system = System(knots, axes, list(blocks.values()), 0.3)
+    prepared = PreparedSystem(system, engine=engine)
+    a = dense_of(system).view(-1, knots.nodes, axes)[:, prepared.ordering.nodes].flatten(1)
+    normal = a.T @ a + 0.09 * torch.eye(a.shape[1], dtype=torch.float64)
+    assert torch.allclose(full(prepared.band()), normal, atol=1e-12 * float(normal.abs().max()))
+    x = torch.randn(len(prepared.ordering.nodes), axes, generator=torch.Generator().manual_seed(0)).double()
+    gradient = a.T @ (system.target() - a @ x.flatten()) - 0.09 * x.flatten()
+    assert torch.allclose(prepared.gradient(x).flatten(), gradient, atol=1e-10 * float(gradient.abs().max()))
+    assert torch.allclose(prepared.gradient().flatten(), a.T @ system.target(), atol=1e-12)
+    log_determinant = float(torch.linalg.slogdet(normal)[1])
+    assert Factor(prepared).log_determinant() == pytest.approx(log_determinant, rel=1e-10)
+
+
+@pytest.mark.parametrize("level", ["base", "avx2", "avx512"])
+def test_every_compiled_variant_agrees(level, tmp_path, monkeypatch):
+    if shutil.which("g++") is None or not native.available():
+        pytest.skip("no compiler here")
+    if native.LEVELS.index(level) > native.library().spline_cpu_level():
+        pytest.skip("this processor cannot run it")
+    knots, blocks = blocks_of(3)
+    prepared = PreparedSystem(System(knots, 3, list(blocks.values()), 0.3), engine="reference")
+    monkeypatch.setenv("TORCHSPH_SPLINE_LEVEL", level)
+    native.library.cache_clear()
+    try:
+        compiled = PreparedSystem(prepared.system, engine="native")
+        assert torch.allclose(compiled.band(), prepared.band(), rtol=1e-10, atol=1e-12)
+    finally:
+        native.library.cache_clear()
+
+
+def test_build_makes_loadable_libraries(tmp_path):
+    if shutil.which("g++") is None:
+        pytest.skip("no compiler here")
+    made = native_build.build(tmp_path)
+    assert made[0].name == "_native_base.so" and all(path.exists() for path in made)
+    with pytest.raises(FileNotFoundError):
+        native_build.build(tmp_path, compiler="no-such-compiler")
 
 
 @pytest.mark.parametrize("axes,degree", [(2, 3), (3, 2), (3, 3), (2, 1)])
@@ -27,12 +97,11 @@ def test_direct_and_lsqr_equal_dense_least_squares(axes, degree):
 
 def test_factor_serves_many_right_hand_sides():
     knots, blocks = blocks_of(2)
-    system = System(knots, 2, list(blocks.values()), 0.3)
-    factor = Factor(system)
-    right = torch.stack([system.right_side(), 2 * system.right_side()], dim=1)
-    both = factor.solve(right)
-    assert torch.allclose(both[:, 1], 2 * both[:, 0]) and torch.allclose(
-        both[:, 0], factor.solve(right[:, 0])
+    prepared = PreparedSystem(System(knots, 2, list(blocks.values()), 0.3))
+    factor, right = Factor(prepared), prepared.gradient()
+    both = factor.solve(torch.stack([right, 2 * right], dim=-1))
+    assert torch.allclose(both[..., 1], 2 * both[..., 0]) and torch.allclose(
+        both[..., 0], factor.solve(right)
     )
 
 

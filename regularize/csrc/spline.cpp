@@ -1,0 +1,314 @@
+// Rows of a tensor-product B-spline system, applied, transposed and summed into the normal matrix.
+//
+// Plain C interface, called through ctypes (see native.py); the torch code in operators.py and assembly.py
+// is the reference that the tests compare with. Local coefficients are in solve order throughout: the caller
+// hands 1-D values with the slowest solve axis first, so that a cell's coefficients have rising positions.
+
+#include <algorithm>
+#include <cstdint>
+#include <cstring>
+#include <vector>
+
+#ifdef _OPENMP
+#include <omp.h>
+#endif
+
+namespace {
+
+#if defined(__AVX512F__)
+constexpr int kWidth = 8;
+#elif defined(__AVX__)
+constexpr int kWidth = 4;
+#else
+constexpr int kWidth = 2;
+#endif
+using Vector = double __attribute__((vector_size(kWidth * 8), aligned(8), may_alias));
+
+constexpr int kRows = 4;              // tile rows held in registers
+constexpr int kCols = 2 * kWidth;     // tile columns: two vectors
+constexpr int kDepth = 32;            // points whose stencils are buffered before they are summed
+constexpr int kMaxComponents = 3;
+constexpr int kMaxAxes = 4;
+
+enum Kind : int32_t { kVector = 0, kDirection = 1, kDivergence = 2, kCellScalar = 3, kCellCoupled = 4 };
+
+}  // namespace
+
+extern "C" {
+
+struct SplineGrid {
+  int32_t axes, components, degree, padded;  // padded: local coefficients rounded up to the tile width
+  int32_t axis_of_component[kMaxAxes];       // place of component k's own axis among the solve axes
+  int64_t cells, nodes;                      // cells that hold rows, active coefficients
+  const int32_t* position;                   // (cells, local) solve positions, rising within a cell
+};
+
+struct SplineRows {
+  int32_t kind, shared;      // shared: all components have the same weight (kVector)
+  int64_t count;             // rows' points; 0 for the cell kinds
+  const int64_t* start;      // (cells + 1) points of each cell; for the cell kinds 0 or 1 blocks
+  const double* value;       // (count, axes, degree + 1)
+  const double* slope;       // the same, derivative per metre (kDivergence only)
+  const double* coefficient; // (count, components): weight, weight * direction, or weight in column 0
+  const double* gram;        // (local, local), or (C, C, local, local) for kCellCoupled
+};
+
+}  // extern "C"
+
+namespace {
+
+int local_size(const SplineGrid& g) {
+  int size = 1;
+  for (int a = 0; a < g.axes; ++a) size *= g.degree + 1;
+  return size;
+}
+
+// Products of the 1-D values of point n; the 1-D derivative on one axis (or -1 for none), times scale.
+void stencil(const SplineGrid& g, const SplineRows& rows, int64_t n, int derived, double scale, double* out) {
+  const int order = g.degree + 1;
+  out[0] = scale;
+  int size = 1;
+  for (int a = 0; a < g.axes; ++a) {
+    const double* one = (a == derived ? rows.slope : rows.value) + (n * g.axes + a) * order;
+    for (int i = size - 1; i >= 0; --i) {  // downwards: the products are expanded in place
+      const double left = out[i];
+      for (int k = 0; k < order; ++k) out[i * order + k] = left * one[k];
+    }
+    size *= order;
+  }
+}
+
+// The row of component k at point n, without the weight of kVector rows.
+void row_of(const SplineGrid& g, const SplineRows& rows, int64_t n, int k, double* out) {
+  const double* c = rows.coefficient + n * g.components;
+  if (rows.kind == kVector) stencil(g, rows, n, -1, 1.0, out);
+  else if (rows.kind == kDirection) stencil(g, rows, n, -1, c[k], out);
+  else stencil(g, rows, n, g.axis_of_component[k], c[0], out);
+}
+
+// out[m][l] += sum_k p[k][m] q[k][l] over tiles with l >= m, p and q (depth, padded).
+void add_products(const double* p, const double* q, int depth, int padded, double* out) {
+  for (int m0 = 0; m0 < padded; m0 += kRows) {
+    for (int l0 = m0 / kCols * kCols; l0 < padded; l0 += kCols) {
+      Vector sum[kRows][2] = {};
+      for (int k = 0; k < depth; ++k) {
+        const Vector* right = reinterpret_cast<const Vector*>(q + k * padded + l0);
+        const Vector a = right[0], b = right[1];
+        for (int r = 0; r < kRows; ++r) {
+          const double left = p[k * padded + m0 + r];
+          sum[r][0] += left * a;
+          sum[r][1] += left * b;
+        }
+      }
+      for (int r = 0; r < kRows; ++r) {
+        Vector* to = reinterpret_cast<Vector*>(out + (m0 + r) * padded + l0);
+        to[0] += sum[r][0];
+        to[1] += sum[r][1];
+      }
+    }
+  }
+}
+
+// Gram blocks of one cell: pair[d][c][m][l] belongs to unknowns (m, d) and (l, c); shared is added for c == d.
+struct CellGram {
+  int components, padded;
+  std::vector<double> pair, shared, panel;
+  bool has_pairs[kMaxComponents][kMaxComponents];
+  bool has_shared;
+
+  CellGram(int components_, int padded_)
+      : components(components_), padded(padded_),
+        pair(size_t(components_) * components_ * padded_ * padded_), shared(size_t(padded_) * padded_),
+        panel(size_t(components_) * kDepth * padded_) {}
+
+  double* block(int d, int c) { return pair.data() + size_t(d * components + c) * padded * padded; }
+  void clear() {
+    std::memset(has_pairs, 0, sizeof has_pairs);
+    has_shared = false;
+  }
+  double* touched(int d, int c) {
+    if (!has_pairs[d][c]) std::fill_n(block(d, c), size_t(padded) * padded, 0.0);
+    has_pairs[d][c] = true;
+    return block(d, c);
+  }
+  double* touched_shared() {
+    if (!has_shared) std::fill(shared.begin(), shared.end(), 0.0);
+    has_shared = true;
+    return shared.data();
+  }
+};
+
+void add_point_rows(const SplineGrid& g, const SplineRows& rows, int64_t begin, int64_t end, CellGram& cell) {
+  const int padded = cell.padded;
+  const size_t panel = size_t(kDepth) * padded;
+  const bool vector = rows.kind == kVector;
+  for (int64_t first = begin; first < end; first += kDepth) {
+    const int depth = int(std::min<int64_t>(kDepth, end - first));
+    const int panels = vector && rows.shared ? 1 : g.components;
+    for (int c = 0; c < panels; ++c) {
+      for (int k = 0; k < depth; ++k) {
+        double* row = cell.panel.data() + c * panel + size_t(k) * padded;
+        std::fill_n(row, padded, 0.0);
+        if (vector) stencil(g, rows, first + k, -1, rows.coefficient[(first + k) * g.components + c], row);
+        else row_of(g, rows, first + k, c, row);
+      }
+    }
+    const double* p = cell.panel.data();
+    if (vector && rows.shared) {
+      add_products(p, p, depth, padded, cell.touched_shared());
+      continue;
+    }
+    for (int d = 0; d < g.components; ++d)
+      for (int c = 0; c < g.components; ++c)
+        if (!vector || c == d)
+          add_products(p + d * panel, p + c * panel, depth, padded, cell.touched(d, c));
+  }
+}
+
+void add_constant(const SplineGrid& g, const SplineRows& rows, int local, CellGram& cell) {
+  auto add = [&](const double* from, double* to) {
+    for (int m = 0; m < local; ++m)
+      for (int l = 0; l < local; ++l) to[m * cell.padded + l] += from[m * local + l];
+  };
+  if (rows.kind == kCellScalar) return add(rows.gram, cell.touched_shared());
+  for (int d = 0; d < g.components; ++d)
+    for (int c = 0; c < g.components; ++c)
+      add(rows.gram + size_t(d * g.components + c) * local * local, cell.touched(d, c));
+}
+
+// Add a cell's blocks to band[(column) * width + (row - column)], row >= column.
+void scatter(const SplineGrid& g, int64_t cell_number, int local, CellGram& cell, double* band, int64_t width) {
+  const int32_t* position = g.position + cell_number * local;
+  const int c_count = g.components, padded = cell.padded;
+  for (int m = 0; m < local; ++m) {
+    for (int d = 0; d < c_count; ++d) {
+      const int64_t column = int64_t(position[m]) * c_count + d;
+      double* out = band + column * width - column;
+      for (int c = 0; c < c_count; ++c) {
+        const bool scalar = c == d && cell.has_shared;
+        if (!cell.has_pairs[d][c] && !scalar) continue;
+        const double* pair = cell.has_pairs[d][c] ? cell.block(d, c) + size_t(m) * padded : nullptr;
+        const double* shared = scalar ? cell.shared.data() + size_t(m) * padded : nullptr;
+        for (int l = c >= d ? m : m + 1; l < local; ++l)
+          out[int64_t(position[l]) * c_count + c] += (pair ? pair[l] : 0.0) + (shared ? shared[l] : 0.0);
+      }
+    }
+  }
+}
+
+// dot and axpy over one point's row; x and out are (nodes, components) in solve order
+double dot_row(const SplineGrid& g, const int32_t* position, int local, const double* row, int k, const double* x) {
+  double sum = 0;
+  for (int l = 0; l < local; ++l) sum += row[l] * x[int64_t(position[l]) * g.components + k];
+  return sum;
+}
+
+void add_row(const SplineGrid& g, const int32_t* position, int local, const double* row, int k, double scale,
+             double* out) {
+  for (int l = 0; l < local; ++l) out[int64_t(position[l]) * g.components + k] += scale * row[l];
+}
+
+}  // namespace
+
+extern "C" {
+
+// 2: AVX-512, 1: AVX2 with FMA, 0: neither. Asked of the portable build to choose among the three.
+int32_t spline_cpu_level() {
+#if defined(__x86_64__)
+  __builtin_cpu_init();
+  if (__builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512dq")) return 2;
+  if (__builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma")) return 1;
+#endif
+  return 0;
+}
+
+int32_t spline_tile_width() { return kCols; }
+
+void spline_set_threads(int32_t threads) {
+#ifdef _OPENMP
+  omp_set_num_threads(threads);
+#else
+  (void)threads;
+#endif
+}
+
+// Sum all blocks' rows into the lower band (nodes * components, width). Cells come in slabs (slab_start, slabs
+// + 1) along the slowest axis; slabs two apart share no coefficient, so even and odd ones take turns.
+void spline_gram(const SplineGrid* grid, const SplineRows* blocks, int32_t block_count, const int64_t* slab_start,
+                 int64_t slabs, double* band, int64_t width) {
+  const SplineGrid& g = *grid;
+  const int local = local_size(g);
+  for (int parity = 0; parity < 2; ++parity) {
+#pragma omp parallel
+    {
+      CellGram cell(g.components, g.padded);
+#pragma omp for schedule(dynamic, 1)
+      for (int64_t slab = parity; slab < slabs; slab += 2) {
+        for (int64_t number = slab_start[slab]; number < slab_start[slab + 1]; ++number) {
+          cell.clear();
+          for (int32_t b = 0; b < block_count; ++b) {
+            const SplineRows& rows = blocks[b];
+            if (rows.kind >= kCellScalar) {
+              if (rows.start[number + 1] > rows.start[number]) add_constant(g, rows, local, cell);
+            } else {
+              add_point_rows(g, rows, rows.start[number], rows.start[number + 1], cell);
+            }
+          }
+          scatter(g, number, local, cell, band, width);
+        }
+      }
+    }
+  }
+}
+
+// out (count or count * C) = rows times x (nodes, C)
+void spline_apply(const SplineGrid* grid, const SplineRows* rows, const double* x, double* out) {
+  const SplineGrid& g = *grid;
+  const int local = local_size(g);
+#pragma omp parallel
+  {
+    std::vector<double> row(g.padded);
+#pragma omp for schedule(static)
+    for (int64_t number = 0; number < g.cells; ++number) {
+      const int32_t* position = g.position + number * local;
+      for (int64_t n = rows->start[number]; n < rows->start[number + 1]; ++n) {
+        double sum = 0;
+        if (rows->kind == kVector) stencil(g, *rows, n, -1, 1.0, row.data());
+        for (int k = 0; k < g.components; ++k) {
+          if (rows->kind != kVector) row_of(g, *rows, n, k, row.data());
+          const double part = dot_row(g, position, local, row.data(), k, x);
+          if (rows->kind == kVector) out[n * g.components + k] = rows->coefficient[n * g.components + k] * part;
+          sum += part;
+        }
+        if (rows->kind != kVector) out[n] = sum;
+      }
+    }
+  }
+}
+
+// out (nodes, C) += rows' times r (count or count * C)
+void spline_adjoint(const SplineGrid* grid, const SplineRows* rows, const double* r, double* out) {
+  const SplineGrid& g = *grid;
+  const int local = local_size(g);
+#pragma omp parallel
+  {
+    std::vector<double> row(g.padded), mine(size_t(g.nodes) * g.components);
+#pragma omp for schedule(static)
+    for (int64_t number = 0; number < g.cells; ++number) {
+      const int32_t* position = g.position + number * local;
+      for (int64_t n = rows->start[number]; n < rows->start[number + 1]; ++n) {
+        if (rows->kind == kVector) stencil(g, *rows, n, -1, 1.0, row.data());
+        for (int k = 0; k < g.components; ++k) {
+          if (rows->kind != kVector) row_of(g, *rows, n, k, row.data());
+          const double scale = rows->kind == kVector
+              ? r[n * g.components + k] * rows->coefficient[n * g.components + k] : r[n];
+          add_row(g, position, local, row.data(), k, scale, mine.data());
+        }
+      }
+    }
+#pragma omp critical
+    for (size_t i = 0; i < mine.size(); ++i) out[i] += mine[i];
+  }
+}
+
+}  // extern "C"

@@ -1,0 +1,181 @@
+"""The compiled assembly (csrc/spline.cpp) behind the same calls as the torch reference.
+
+Install builds three shared libraries (see native_build.py); the best one that the processor can run is
+loaded at first use. ``available()`` says whether there is one, ``require()`` why there is none.
+"""
+
+import ctypes
+import os
+from functools import lru_cache
+from pathlib import Path
+
+import torch
+
+from .assembly import cell_gram, empty_band
+from .bspline import basis
+from .operators import CellRows, DirectionRows, DivergenceRows, RowBlock, System, VectorRows
+from .ordering import Ordering, local_permutation
+
+LEVELS = ("base", "avx2", "avx512")
+KINDS = {VectorRows: 0, DirectionRows: 1, DivergenceRows: 2}
+
+
+class _Grid(ctypes.Structure):
+    _fields_ = [
+        ("axes", ctypes.c_int32),
+        ("components", ctypes.c_int32),
+        ("degree", ctypes.c_int32),
+        ("padded", ctypes.c_int32),
+        ("axis_of_component", ctypes.c_int32 * 4),
+        ("cells", ctypes.c_int64),
+        ("nodes", ctypes.c_int64),
+        ("position", ctypes.c_void_p),
+    ]
+
+
+class _Rows(ctypes.Structure):
+    _fields_ = [
+        ("kind", ctypes.c_int32),
+        ("shared", ctypes.c_int32),
+        ("count", ctypes.c_int64),
+        ("start", ctypes.c_void_p),
+        ("value", ctypes.c_void_p),
+        ("slope", ctypes.c_void_p),
+        ("coefficient", ctypes.c_void_p),
+        ("gram", ctypes.c_void_p),
+    ]
+
+
+@lru_cache
+def library() -> ctypes.CDLL | None:
+    """The fastest compiled library this processor runs, or None; TORCHSPH_SPLINE_LEVEL names one instead."""
+    folder = Path(__file__).parent
+    portable = folder / "_native_base.so"
+    if not portable.exists():
+        return None
+    level = os.environ.get("TORCHSPH_SPLINE_LEVEL")
+    if level is None:
+        level = LEVELS[ctypes.CDLL(str(portable)).spline_cpu_level()]
+    chosen = folder / f"_native_{level}.so"
+    lib = ctypes.CDLL(str(chosen if chosen.exists() else portable))
+    for name in ("spline_gram", "spline_apply", "spline_adjoint", "spline_set_threads"):
+        getattr(lib, name).restype = None
+    return lib
+
+
+def available() -> bool:
+    """Whether a compiled library was built with this install."""
+    return library() is not None
+
+
+class PackedSystem:
+    """A system in solve order: rows sorted by cell with their 1-D values, ready for the compiled code.
+
+    Vectors here are (active coefficients, C) in solve order; everything is float64 on the CPU.
+    """
+
+    def __init__(self, system: System, ordering: Ordering) -> None:
+        self.system, self.ordering, self.lib = system, ordering, library()
+        self._keep: list[torch.Tensor] = []
+        knots, tile = ordering.knots, self.lib.spline_tile_width()
+        place = [ordering.axes.index(k) for k in range(system.components)]
+        self.grid = _Grid(
+            axes=knots.axes,
+            components=system.components,
+            degree=knots.degree,
+            padded=-(-knots.local_size // tile) * tile,
+            axis_of_component=(ctypes.c_int32 * 4)(*place),
+            cells=len(ordering.keys),
+            nodes=len(ordering.nodes),
+            position=self._pointer(ordering.position.int()),
+        )
+        self.lib.spline_set_threads(torch.get_num_threads())
+        self.sorted: list[torch.Tensor] = []
+        self.rows = [self._pack(block) for block in system.blocks]
+
+    def band(self) -> torch.Tensor:
+        """As :func:`regularize.assembly.reference_band`."""
+        band = empty_band(self.system, self.ordering)
+        slabs = self.ordering.slabs().contiguous()
+        blocks = (_Rows * len(self.rows))(*self.rows)
+        self.lib.spline_gram(
+            ctypes.byref(self.grid),
+            blocks,
+            ctypes.c_int32(len(self.rows)),
+            ctypes.c_void_p(slabs.data_ptr()),
+            ctypes.c_int64(len(slabs) - 1),
+            ctypes.c_void_p(band.data_ptr()),
+            ctypes.c_int64(band.shape[1]),
+        )
+        return band
+
+    def gradient(self, x: torch.Tensor | None) -> torch.Tensor:
+        """A'(b - A x) - damping^2 x; A'b where x is None. x and the result (active, C) in solve order."""
+        out = torch.zeros(self.grid.nodes, self.grid.components, dtype=torch.float64)
+        for block, rows, index in zip(self.system.blocks, self.rows, self.sorted, strict=True):
+            if isinstance(block, CellRows):
+                if x is not None:
+                    self._subtract_cells(block, index, x, out)
+                continue
+            residual = block.target.double().view(len(block), -1)[index].contiguous()
+            if x is not None:
+                fitted = torch.empty_like(residual)
+                self.lib.spline_apply(*self._call(rows, x, fitted))
+                residual -= fitted
+            self.lib.spline_adjoint(*self._call(rows, residual, out))
+        return out if x is None else out - self.system.damping**2 * x
+
+    def _call(self, rows: _Rows, given: torch.Tensor, out: torch.Tensor) -> tuple:
+        pointers = (ctypes.c_void_p(given.data_ptr()), ctypes.c_void_p(out.data_ptr()))
+        return ctypes.byref(self.grid), ctypes.byref(rows), *pointers
+
+    def _subtract_cells(
+        self, block: CellRows, slots: torch.Tensor, x: torch.Tensor, out: torch.Tensor
+    ) -> None:
+        near = self.ordering.position[slots]
+        gram = cell_gram(block)[local_permutation(self.ordering)][:, :, local_permutation(self.ordering)]
+        pulled = x[near].flatten(1) @ gram.flatten(0, 1).flatten(1, 2)
+        out.index_add_(0, near.flatten(), pulled.view(-1, block.components), alpha=-1.0)
+
+    def _pack(self, block: RowBlock) -> _Rows:
+        slot = self.ordering.slots(block.cell)
+        index = torch.argsort(slot, stable=True)
+        start = torch.searchsorted(slot[index], torch.arange(len(self.ordering.keys) + 1))
+        self.sorted.append(slot if isinstance(block, CellRows) else index)
+        if isinstance(block, CellRows):
+            return self._pack_cells(block, start)
+        weight = block.weight[index].double()
+        shared = False
+        if isinstance(block, VectorRows):
+            coefficient, shared = weight, bool((weight == weight[:, :1]).all())
+        elif isinstance(block, DirectionRows):
+            coefficient = weight[:, None] * block.direction[index].double()
+        else:
+            coefficient = weight[:, None].repeat(1, block.components)
+        t = block.t[index][:, list(self.ordering.axes)].double()
+        slope = None
+        if isinstance(block, DivergenceRows):
+            spacing = torch.tensor([block.knots.spacing[k] for k in self.ordering.axes], dtype=torch.float64)
+            slope = self._pointer(basis(t, block.knots.degree, 1) / spacing[:, None])
+        return _Rows(
+            kind=KINDS[type(block)],
+            shared=shared,
+            count=len(block),
+            start=self._pointer(start),
+            value=self._pointer(basis(t, block.knots.degree)),
+            slope=slope,
+            coefficient=self._pointer(coefficient),
+        )
+
+    def _pack_cells(self, block: CellRows, start: torch.Tensor) -> _Rows:
+        local = local_permutation(self.ordering)
+        gram = cell_gram(block)[local][:, :, local].permute(1, 3, 0, 2)  # (C, C, L, L)
+        scalar = not block.coupled
+        gram = gram[0, 0] if scalar else gram
+        return _Rows(kind=3 if scalar else 4, count=0, start=self._pointer(start), gram=self._pointer(gram))
+
+    def _pointer(self, tensor: torch.Tensor) -> int:
+        """Address of a contiguous copy that lives as long as this object."""
+        tensor = tensor.contiguous()
+        self._keep.append(tensor)
+        return tensor.data_ptr()

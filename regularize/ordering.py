@@ -1,0 +1,79 @@
+"""Numbering of the coefficients that rows touch, longest axis slowest: a banded normal matrix."""
+
+from dataclasses import dataclass
+
+import torch
+
+from .knots import Knots
+from .operators import System
+
+
+@dataclass(frozen=True)
+class Ordering:
+    """Solve order of the touched coefficients of one set of knot cells."""
+
+    knots: Knots
+    axes: tuple[int, ...]  # point axes (x = 0), slowest in solve order first
+    keys: torch.Tensor  # (cells,) sorted solve-order numbers of the cells that hold rows
+    nodes: torch.Tensor  # (active,) flat coefficient numbers in solve order
+    position: torch.Tensor  # (cells, L) solve positions of each cell's coefficients, rising along L
+    half_bandwidth: int  # in coefficients: largest position difference within a cell
+
+    def key(self, cell: torch.Tensor) -> torch.Tensor:
+        """Solve-order number (n,) of cells (n, A)."""
+        number = torch.zeros(cell.shape[:-1], dtype=torch.int64, device=cell.device)
+        for axis in self.axes:
+            number = number * self.knots.cells[axis] + cell[..., axis]
+        return number
+
+    def slots(self, cell: torch.Tensor) -> torch.Tensor:
+        """Place (n,) of cells (n, A) in ``keys``; they must be among them."""
+        return torch.searchsorted(self.keys, self.key(cell))
+
+    def slabs(self) -> torch.Tensor:
+        """(slabs + 1,) starts in ``keys`` of runs of degree + 1 cell layers along the slowest axis.
+
+        Cells of slabs two apart touch no common coefficient.
+        """
+        layer = self.keys
+        for axis in self.axes[1:]:
+            layer = layer // self.knots.cells[axis]
+        slab = layer // (self.knots.degree + 1)
+        edges = torch.arange(int(slab[-1]) + 2, device=slab.device)
+        return torch.searchsorted(slab, edges)
+
+
+def order(system: System) -> Ordering:
+    """Number the coefficients that ``system`` touches; the longest axis runs slowest (narrowest band)."""
+    knots = system.knots
+    # the sort is stable, so that a cube keeps the array order: last axis slowest, x fastest
+    axes = tuple(sorted(reversed(range(knots.axes)), key=lambda k: -knots.cells[k]))
+    cell = torch.cat([block.cell for block in system.blocks])
+    blank = Ordering(knots, axes, *[torch.empty(0)] * 3, 0)
+    keys = torch.unique(blank.key(cell))
+    number, columns = keys, {}
+    for axis in reversed(axes):
+        columns[axis] = number % knots.cells[axis]
+        number = number // knots.cells[axis]
+    cell = torch.stack([columns[axis] for axis in range(knots.axes)], dim=-1)
+    array_axes = [knots.axes - 1 - axis for axis in axes]
+    size = (knots.degree + 1,) * knots.axes
+    local = torch.arange(knots.local_size, device=keys.device).view(size).permute(array_axes).flatten()
+    touched = knots.local_nodes(cell)[:, local]
+    used = torch.zeros(knots.nodes, dtype=torch.bool, device=keys.device)
+    used[touched.flatten()] = True
+    flat = torch.arange(knots.nodes, device=keys.device).view(knots.shape).permute(array_axes).flatten()
+    nodes = flat[used[flat]]
+    place = torch.empty(knots.nodes, dtype=torch.int64, device=keys.device)
+    place[nodes] = torch.arange(len(nodes), device=keys.device)
+    position = place[touched]
+    half = int((position[:, -1] - position[:, 0]).max())
+    return Ordering(knots, axes, keys, nodes, position, half)
+
+
+def local_permutation(ordering: Ordering) -> torch.Tensor:
+    """(L,) array-order place of each solve-order local coefficient."""
+    knots = ordering.knots
+    array_axes = [knots.axes - 1 - axis for axis in ordering.axes]
+    size = (knots.degree + 1,) * knots.axes
+    return torch.arange(knots.local_size).view(size).permute(array_axes).flatten()
