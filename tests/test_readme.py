@@ -43,7 +43,7 @@ def test_the_project_file_defines_what_the_commands_need():
 def test_commands_of_the_table_are_those_of_the_program():
     named = set(re.findall(r"^\| `torchsph (\w+)", README, re.MULTILINE))
     helped = build_parser({name: print for name in named}, ("default",)).format_help()
-    assert named == set(re.findall(r"^    (\w+) ", helped, re.MULTILINE))
+    assert named == set(re.findall(r"^    (\w+)\b", helped, re.MULTILINE))
     assert f"`{OUT}/`" in README
 
 
