@@ -16,7 +16,10 @@ def test_staged_files_arrive_together(tmp_path):
         (scratch / "one").write_text("1")
         (scratch / "two").write_text("2")
         assert not (tmp_path / "a" / "b" / "one").exists()
-    assert {path.name: path.read_text() for path in (tmp_path / "a" / "b").iterdir()} == {"one": "1", "two": "2"}
+    assert {path.name: path.read_text() for path in (tmp_path / "a" / "b").iterdir()} == {
+        "one": "1",
+        "two": "2",
+    }
 
 
 def test_staged_files_vanish_on_failure_and_others_stay(tmp_path):
