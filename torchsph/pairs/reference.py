@@ -8,7 +8,14 @@ import torch
 from torch import Tensor
 
 from .interface import (
-    Backend, MomentumTerms, PairState, Rates, RateTerms, Support, check_search, per_particle,
+    Backend,
+    MomentumTerms,
+    PairState,
+    Rates,
+    RateTerms,
+    Support,
+    check_search,
+    per_particle,
 )
 from .search import half_pairs
 

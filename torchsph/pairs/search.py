@@ -111,3 +111,33 @@ def _square_distance(position: Tensor, first: Tensor, second: Tensor, period: Te
         length = torch.where(finite, period, torch.ones_like(period)).to(position.dtype)
         gap = torch.where(finite, gap - length * torch.round(gap / length), gap)
     return (gap * gap).sum(1)
+
+
+def cross_pairs(
+    query: Tensor, query_member: Tensor, position: Tensor, member: Tensor, radius: float
+) -> tuple[Tensor, Tensor]:
+    """All (query, particle) index pairs of one member closer than ``radius``, sorted by query; (P,) int64 each."""
+    empty = torch.zeros(0, dtype=torch.int64, device=position.device)
+    if query.shape[0] == 0 or position.shape[0] == 0:
+        return empty, empty
+    both, members = torch.cat([position, query]).detach(), torch.cat([member, query_member])
+    cell, cells = _cells(both, radius, None)
+    count = position.shape[0]
+    key = _key(cell[:count], members[:count], cells)
+    order = torch.argsort(key)
+    sorted_key = key[order]
+    rows, found = [], []
+    for offset in itertools.product((-1, 0, 1), repeat=position.shape[1]):
+        target, real = _shifted(cell[count:], offset, cells, None)
+        wanted = _key(target, members[count:], cells)
+        start = torch.searchsorted(sorted_key, wanted)
+        stop = torch.where(real, torch.searchsorted(sorted_key, wanted, right=True), start)
+        row, at = _expand(start, stop)
+        at = order[at]
+        gap = query.index_select(0, row) - position.index_select(0, at)
+        close = (gap * gap).sum(1) < radius * radius
+        rows.append(row[close])
+        found.append(at[close])
+    row, at = torch.cat(rows), torch.cat(found)
+    by_row = torch.argsort(row, stable=True)
+    return row[by_row], at[by_row]

@@ -1,0 +1,218 @@
+"""The world around the particles during a run: walls, valves, forces and periodic sides, in internal units."""
+
+from __future__ import annotations
+
+import bisect
+
+import torch
+from torch import Tensor
+
+from geometry import Grid
+
+from .pairs.interface import per_particle
+from .particles import Particles
+from .record import Record
+from .scene import Scene
+from .schemes import CompleteKernelWall, PressureSource, Reservoir, WeaklyCompressible
+from .smoothing import kernel
+from .transfer import fill_beyond
+from .units import Units
+from .wallfield import WallFields
+from .walls import WallSample
+
+# a particle this far beyond a wall (spacings) counts as outside; the soft potential is meant to be entered a little
+_OUTSIDE = 0.5
+
+
+class Domain:
+    """Walls, valves and body forces at the present time of every member.
+
+    ``enter`` chooses the key frames and open valves of an interval, ``at`` sets the members' times inside it.
+    """
+
+    def __init__(
+        self, scene: Scene, scheme: WeaklyCompressible, units: Units, device: str, dtype: torch.dtype
+    ) -> None:
+        self.scene, self.scheme, self.units = scene, scheme, units
+        self.device, self.dtype = device, dtype
+        smoothing = kernel(scheme.kernel)
+        self.support_radius = smoothing.support * scheme.smoothing_ratio
+        self.period = self._period()
+        self._gravity = None
+        if scene.gravity is not None:
+            self._gravity = torch.tensor(scene.gravity, dtype=dtype, device=device) / units.acceleration
+        self.walls: WallFields | None = None
+        self.sources = self.reservoirs = None
+        self._open: tuple[int, ...] = ()
+        self._bracket: tuple[float, float] = (0.0, 1.0)
+        self._keys: tuple[Tensor, Tensor] | None = None
+        self._times: Tensor | None = None
+        if scene.walls is not None:
+            complete = isinstance(scheme.wall, CompleteKernelWall)
+            self.walls = WallFields(
+                scene.walls, units.length, units.speed, smoothing, scheme.smoothing_ratio, complete, device, dtype
+            )
+            self._make_valves()
+
+    def _make_valves(self) -> None:
+        from .reservoirs import Reservoirs  # here, because reservoirs need the domain's wall fields
+        from .sources import Sources
+
+        if self.scene.valves and isinstance(self.scheme.valve, PressureSource):
+            self.sources = Sources(self.scene, self.scheme.valve, self.units, self.device, self.dtype)
+        if self.scene.valves and isinstance(self.scheme.valve, Reservoir):
+            self.reservoirs = Reservoirs(self)
+
+    def _period(self) -> Tensor | None:
+        if self.scene.period is None:
+            return None
+        lengths = [float("inf") if p is None else p / self.units.length for p in self.scene.period]
+        return torch.tensor(lengths, dtype=self.dtype, device=self.device)
+
+    def breaks(self, start: float, stop: float) -> list[float]:
+        """The times in (start, stop] at which members meet: key frames, valve events, and ``stop``."""
+        times = {stop}
+        if self.walls is not None:
+            times.update(float(t) for t in self.walls.motion.time)
+        if self.scheme.valve is not None:
+            times.update(t for valve in self.scene.valves for t in valve.events())
+        tolerance = 1e-9 * max(1.0, abs(stop))
+        inner = sorted(t for t in times if start + tolerance < t < stop - tolerance)
+        return [*inner, stop] if stop > start else []
+
+    def enter(self, start: float, stop: float, *, shut: bool = False) -> None:
+        """Choose key frames and open valves for an interval without breaks inside; ``shut`` closes every valve."""
+        middle = 0.5 * (start + stop)
+        self._open = ()
+        if self.scheme.valve is not None and not shut:
+            self._open = tuple(v.region for v in self.scene.valves if v.is_open(middle))
+        self.middle = middle  # s, of the present interval
+        if self.walls is not None:
+            times = self.walls.motion.time
+            late = min(max(bisect.bisect_left(times, middle), 1), len(times) - 1) if len(times) > 1 else 0
+            early = max(late - 1, 0)
+            self._bracket = (float(times[early]), float(times[late]))
+            self._keys = (self.walls.key(early, self._open), self.walls.key(late, self._open))
+        self.at(start)
+
+    @property
+    def open_regions(self) -> tuple[int, ...]:
+        """Regions of the valves that are open in the present interval."""
+        return self._open
+
+    def at(self, times: Tensor | float) -> None:
+        """Set the present time of the members, s: (members,) float64 or one for all."""
+        self._times = torch.as_tensor(times, dtype=torch.float64, device=self.device)
+
+    def time_of(self, particles: Particles) -> Tensor:
+        """Present time of each particle's member, s, (N,) float64."""
+        return self.member_times(particles.members).index_select(0, particles.member)
+
+    def member_times(self, members: int) -> Tensor:
+        """Present time of each member, s, (members,) float64."""
+        return self._times.expand(members) if self._times.ndim == 0 else self._times
+
+    def sample(self, particles: Particles) -> WallSample | None:
+        """Walls at the particles, or None."""
+        if self.walls is None:
+            return None
+        early, late = self._bracket
+        fraction = torch.zeros((), dtype=self.dtype, device=self.device)
+        if late > early:
+            share = (self._times - early) / (late - early)
+            fraction = share.clamp(0.0, 1.0).to(self.dtype)
+            fraction = per_particle(fraction, particles.member) if fraction.ndim else fraction
+        return self.walls.sample(*self._keys, fraction, particles.position)
+
+    def sample_at(self, position: Tensor) -> WallSample:
+        """Walls at points (n, D), internal, at the present time (one for all members)."""
+        early, late = self._bracket
+        share = float((self._times.max() - early) / (late - early)) if late > early else 0.0
+        fraction = torch.full((), min(max(share, 0.0), 1.0), dtype=self.dtype, device=self.device)
+        return self.walls.sample(*self._keys, fraction, position)
+
+    def body_force(self, particles: Particles) -> Tensor | None:
+        """Acceleration (N, D) by gravity and pressure sources, or None."""
+        total = None if self._gravity is None else self._gravity.expand_as(particles.position)
+        if self.sources is not None and self._open:
+            push = self.sources.acceleration(particles, self._open, self.time_of(particles))
+            total = push if total is None else total + push
+        return total
+
+    def prepare(self, particles: Particles) -> Particles:
+        """What an interval needs before its first step: buffers behind valves that have just opened."""
+        return particles if self.reservoirs is None else self.reservoirs.opened(particles)
+
+    def finish(self, particles: Particles, record: Record, time: float) -> Particles:
+        """What an interval leaves behind: periodic positions wrapped, particles gone through a valve taken out."""
+        particles = self._wrapped(particles)
+        return particles if self.sources is None else self.sources.without_gone(particles, self._open, time, record)
+
+    def exchange(self, particles: Particles, record: Record) -> tuple[Particles, bool]:
+        """Pass particles between fluid and buffers; True where the particles were renumbered."""
+        if self.reservoirs is None or not self._open:
+            return particles, False
+        return self.reservoirs.exchange(particles, record)
+
+    def constrain(self, particles: Particles, record: Record) -> Particles:
+        """Keep particles inside hard walls and drive the buffers; soft potential walls need nothing."""
+        if self.reservoirs is not None and self._open:
+            particles = self.reservoirs.driven(particles)
+        if self.walls is None or not isinstance(self.scheme.wall, CompleteKernelWall):
+            return particles
+        wall = self.sample(particles)
+        gap = self.scheme.wall.gap
+        near = (wall.distance < gap) & particles.fluid
+        record.crossed_wall += particles.per_member((near & (wall.distance < 0)).to(torch.int64), "sum")
+        push = torch.where(near, gap - wall.distance, torch.zeros_like(wall.distance))
+        towards = ((particles.velocity - wall.velocity) * wall.normal).sum(1).clamp_max(0.0)
+        stop = torch.where(near, towards, torch.zeros_like(towards))
+        return particles.changed(
+            position=particles.position + push[:, None] * wall.normal,
+            velocity=particles.velocity - stop[:, None] * wall.normal,
+        )
+
+    def _wrapped(self, particles: Particles) -> Particles:
+        if self.period is None:
+            return particles
+        finite = torch.isfinite(self.period)
+        length = torch.where(finite, self.period, torch.ones_like(self.period))
+        inside = torch.where(finite, torch.remainder(particles.position, length), particles.position)
+        return particles.changed(position=inside)
+
+    def account(self, particles: Particles, record: Record, time: float) -> None:
+        """Count the particles that are beyond the walls now."""
+        self.at(time)
+        wall = self.sample(particles)
+        if wall is not None:
+            beyond = (wall.distance < -_OUTSIDE) & particles.fluid
+            record.outside = particles.per_member(beyond.to(torch.int64), "sum")
+
+    def imposed(self, particles: Particles, grid: Grid, velocity: Tensor, mask: Tensor, time: float) -> Particles:
+        """Particles with the velocity of a grid field, continued beyond its mask by the walls' velocity."""
+        self.enter(time, time)
+        lead = velocity.to(self.device, self.dtype).reshape(-1, *velocity.shape[-grid.dimension - 1 :])
+        field = fill_beyond(lead, mask.to(self.device), grid, self)
+        if self.reservoirs is not None:
+            particles = self.reservoirs.opened(particles)
+            points = self.reservoirs.mouth_points(particles)
+        else:
+            points = particles.position
+        return particles.changed(velocity=self.sampled(particles, grid, field, points))
+
+    def sampled(
+        self, particles: Particles, grid: Grid, field: Tensor, position: Tensor | None = None
+    ) -> Tensor:
+        """A grid field (members or 1, D, *shape), m/s, at the particles or at ``position``: (N, D), internal."""
+        points = (particles.position if position is None else position) * self.units.length
+        field = field.to(self.device, self.dtype)
+        field = field if field.ndim == grid.dimension + 2 else field[None]
+        if field.shape[0] == 1:
+            return grid.sample(field[0], points).T / self.units.speed
+        parts = [
+            grid.sample(field[b], points[particles.member == b]).T for b in range(particles.members)
+        ]
+        value = torch.empty_like(particles.velocity)
+        for b, part in enumerate(parts):
+            value[particles.member == b] = part
+        return value / self.units.speed

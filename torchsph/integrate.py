@@ -1,0 +1,255 @@
+"""One time step of the weakly compressible scheme: which sums are taken where, and what they change."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor
+
+from .pairs.interface import Backend, MomentumTerms, Rates, RateTerms, Support, per_particle
+from .particles import Particles
+from .schemes import CompleteKernelWall, PotentialWall, WeaklyCompressible
+from .smoothing import kernel
+from .terms import shifting_displacement, tait_pressure
+from .walls import WallSample, friction, potential_force, retardation, wall_pressure_force
+
+# a particle whose kernel lies almost wholly behind walls would divide by nothing
+_SMALLEST_KERNEL_SHARE = 0.1
+
+
+class Surroundings(Protocol):
+    """What a step asks about the world around the particles; times are those of the current step."""
+
+    def sample(self, particles: Particles) -> WallSample | None:
+        """Walls at the particles, or None where the scene has none."""
+
+    def body_force(self, particles: Particles) -> Tensor | None:
+        """Acceleration (N, D) by gravity and pressure sources, or None."""
+
+
+@dataclass
+class PairSearch:
+    """The neighbour list and where the particles were when it was made."""
+
+    backend: Backend
+    radius: float
+    margin: float
+    period: Tensor | None = None
+    pairs: Any = None
+    made_at: Tensor | None = None
+    searches: int = 0
+
+    def stale(self, particles: Particles) -> bool:
+        """Whether the particles have moved, or changed in number, beyond what the list allows for."""
+        if self.made_at is None or self.made_at.shape != particles.position.shape:
+            return True
+        if particles.count == 0:
+            return False
+        moved = (particles.position - self.made_at).square().sum(1).amax().item()
+        return not moved < (0.5 * self.margin) ** 2
+
+    def at(self, particles: Particles) -> Any:
+        """Pairs that are valid at the particles' present positions."""
+        if self.stale(particles):
+            self.pairs = self.backend.search(
+                particles.position, particles.member, self.radius, margin=self.margin, period=self.period
+            )
+            self.made_at = particles.position
+            self.searches += 1
+        return self.pairs
+
+    def forget(self) -> None:
+        """The particles were renumbered: the next call searches anew."""
+        self.made_at = None
+
+
+@dataclass(frozen=True)
+class Coefficients:
+    """The scheme's options in internal units; entries may be tensors (members,)."""
+
+    sound_speed: float | Tensor
+    viscosity: float | Tensor | None
+    artificial: float | Tensor | None
+    smoothing_length: float
+
+
+class Stepper:
+    """Steps particles with one scheme; holds no state but the neighbour list."""
+
+    def __init__(
+        self, scheme: WeaklyCompressible, coefficients: Coefficients, search: PairSearch, dimension: int
+    ) -> None:
+        self.scheme, self.coefficients, self.pair_search = scheme, coefficients, search
+        self.support = Support(kernel(scheme.kernel), coefficients.smoothing_length, dimension)
+        velocity_xsph = scheme.xsph is not None and scheme.xsph.level == "velocity"
+        self.velocity_xsph = scheme.xsph.epsilon if velocity_xsph else None
+        self.position_xsph = scheme.xsph.epsilon if scheme.xsph is not None and not velocity_xsph else None
+        self.momentum_terms = MomentumTerms(
+            pressure=scheme.pressure, artificial=coefficients.artificial, laminar=coefficients.viscosity
+        )
+        self._rate_terms = RateTerms(
+            continuity=scheme.continuity, diffusion=scheme.density_diffusion is not None,
+            concentration=scheme.shifting is not None, xsph=self.position_xsph is not None,
+        )
+
+    def step(
+        self, particles: Particles, step: Tensor, number: int, around: Surroundings
+    ) -> tuple[Particles, Tensor]:
+        """Advance every member by its own ``step`` (members,), internal time; ``number`` counts the steps.
+
+        Returns the particles and the acceleration (N, D) of the fluid that the next step's force limit needs.
+        """
+        if self.scheme.order == "thesis":
+            return self._thesis_step(particles, step, number, around)
+        return self._symplectic_step(particles, step, number, around)
+
+    def _symplectic_step(
+        self, particles: Particles, step: Tensor, number: int, around: Surroundings
+    ) -> tuple[Particles, Tensor]:
+        """Both passes at the same position; velocity first, then position (symplectic Euler)."""
+        dt = per_particle(step, particles.member)
+        wall = around.sample(particles)
+        pairs = self.pair_search.at(particles)
+        filtering = self._filter_due(number)
+        terms = self._rate_terms if not filtering else _with_shepard(self._rate_terms)
+        rates = self.pair_search.backend.rates(pairs, self._pressureless(particles), self.support, terms)
+        compression, crowding = self._complete(particles, rates, wall)
+        particles = self._new_density(particles, rates, compression, dt, filtering)
+        acceleration = self._acceleration(particles, pairs, compression, wall, around)
+        fluid = particles.fluid[:, None]
+        velocity = torch.where(fluid, particles.velocity + dt[:, None] * acceleration, particles.velocity)
+        particles = self._retarded(particles.changed(velocity=velocity), wall, dt)
+        drift = dt[:, None] * particles.velocity
+        if rates.xsph is not None:
+            drift = drift + torch.where(fluid, self.position_xsph * dt[:, None] * rates.xsph, 0.0)
+        if crowding is not None:
+            shift = shifting_displacement(
+                particles, crowding, step, self.coefficients.smoothing_length, self.scheme.shifting
+            )
+            drift = drift + torch.where(fluid, shift, 0.0)
+        return particles.changed(position=particles.position + drift), acceleration
+
+    def _thesis_step(
+        self, particles: Particles, step: Tensor, number: int, around: Surroundings
+    ) -> tuple[Particles, Tensor]:
+        """Algorithm 1 as printed: density and position with p^n, then forces at the new position, then XSPH.
+
+        First order where forces depend on velocity or density (errata to algorithm 1); kept as the thesis's scheme.
+        """
+        dt = per_particle(step, particles.member)
+        backend = self.pair_search.backend
+        pairs = self.pair_search.at(particles)
+        wall = around.sample(particles) if isinstance(self.scheme.wall, CompleteKernelWall) else None
+        rates = backend.rates(pairs, self._pressureless(particles), self.support, self._rate_terms)
+        compression, _ = self._complete(particles, rates, wall)
+        particles = self._new_density(particles, rates, compression, dt, filtering=False)
+        particles = particles.changed(position=particles.position + dt[:, None] * particles.velocity)
+        pairs, wall = self.pair_search.at(particles), around.sample(particles)
+        acceleration = self._acceleration(particles, pairs, compression, wall, around)
+        particles = particles.changed(velocity=particles.velocity + dt[:, None] * acceleration)
+        particles = self._retarded(particles, wall, dt)
+        filtering = self._filter_due(number)
+        if self.velocity_xsph is not None or filtering:
+            wanted = RateTerms(continuity=None, xsph=self.velocity_xsph is not None, shepard=filtering)
+            sums = backend.rates(pairs, self._pressureless(particles), self.support, wanted)
+            if sums.xsph is not None:
+                # a step of zero length (a member that waits for the others) must not smooth
+                share = (dt > 0).to(dt.dtype)[:, None] * self.velocity_xsph
+                particles = particles.changed(velocity=particles.velocity + share * sums.xsph)
+            if filtering:
+                particles = particles.changed(deviation=_filtered(particles, sums, dt))
+        return particles, acceleration
+
+    def _filter_due(self, number: int) -> bool:
+        period = self.scheme.shepard_period
+        return period is not None and number % period == period - 1
+
+    @staticmethod
+    def _pressureless(particles: Particles) -> Any:
+        return particles.state(particles.deviation)
+
+    def _complete(
+        self, particles: Particles, rates: Rates, wall: WallSample | None
+    ) -> tuple[Tensor, Tensor | None]:
+        """Velocity divergence and crowding gradient with the part of the kernel behind the wall added.
+
+        Ferrand et al. 2013 eqs. 20-22 with the wall's velocity: the sums are divided by the share of the kernel
+        inside the fluid, and the wall contributes its surface integral.
+        """
+        divergence = rates.divergence
+        if self.scheme.continuity == "mass":
+            divergence = divergence / (1.0 + particles.deviation)  # 2.19 gives the density rate, rho0 = 1
+        crowding = rates.concentration
+        if wall is None or wall.share is None:
+            return divergence, crowding
+        share = wall.share.clamp_min(_SMALLEST_KERNEL_SHARE)
+        swept = ((wall.velocity - particles.velocity) * wall.share_gradient).sum(1)
+        divergence = (divergence - swept) / share
+        if crowding is not None:
+            crowding = crowding - wall.share_gradient
+        return divergence, crowding
+
+    def _new_density(
+        self, particles: Particles, rates: Rates, divergence: Tensor, dt: Tensor, filtering: bool
+    ) -> Particles:
+        rate = -(1.0 + particles.deviation) * divergence
+        if rates.diffusion is not None:
+            sound = per_particle(self.coefficients.sound_speed, particles.member)
+            rate = rate + self.scheme.density_diffusion * self.coefficients.smoothing_length * sound * rates.diffusion
+        deviation = particles.deviation + dt * rate
+        if filtering:
+            deviation = _filtered(particles.changed(deviation=deviation), rates, dt)
+        return particles.changed(deviation=deviation)
+
+    def pressure(self, particles: Particles, divergence: Tensor | None = None) -> Tensor:
+        """p / rho0 (N,): equation of state, background (symmetric form only), damping of sound.
+
+        Forms other than the symmetric one leave the background out: it must not change an incompressible flow.
+        """
+        sound = per_particle(self.coefficients.sound_speed, particles.member)
+        pressure = tait_pressure(particles.deviation, sound, self.scheme.gamma)
+        if self.scheme.pressure == "symmetric":
+            pressure = pressure + self.scheme.background_pressure * sound**2
+        if self.scheme.bulk_damping is not None and divergence is not None:
+            damping = self.scheme.bulk_damping * sound * self.coefficients.smoothing_length * divergence
+            pressure = pressure - torch.where(particles.fluid, damping, torch.zeros_like(damping))
+        return pressure
+
+    def _acceleration(
+        self, particles: Particles, pairs: Any, divergence: Tensor, wall: WallSample | None, around: Surroundings
+    ) -> Tensor:
+        pressure = self.pressure(particles, divergence)
+        state = particles.state(pressure)
+        acceleration = self.pair_search.backend.momentum(pairs, state, self.support, self.momentum_terms)
+        body = around.body_force(particles)
+        if wall is not None and wall.share is not None:
+            push = wall_pressure_force(self.scheme.pressure, pressure, particles.deviation, wall)
+            acceleration = acceleration + push
+            if self.scheme.wall.no_slip and self.coefficients.viscosity is not None:
+                nu = per_particle(self.coefficients.viscosity, particles.member)
+                acceleration = acceleration + friction(nu, particles.velocity, wall)
+            acceleration = acceleration / wall.share.clamp_min(_SMALLEST_KERNEL_SHARE)[:, None]
+        elif wall is not None and isinstance(self.scheme.wall, PotentialWall):
+            sound = per_particle(self.coefficients.sound_speed, particles.member)
+            acceleration = acceleration + potential_force(self.scheme.wall, sound, wall)
+        return acceleration if body is None else acceleration + body
+
+    def _retarded(self, particles: Particles, wall: WallSample | None, dt: Tensor) -> Particles:
+        model = self.scheme.wall
+        if wall is None or not isinstance(model, PotentialWall) or model.relaxation is None:
+            return particles
+        sound = per_particle(self.coefficients.sound_speed, particles.member)
+        velocity = retardation(model, sound, dt, particles.velocity, wall)
+        return particles.changed(velocity=torch.where(particles.fluid[:, None], velocity, particles.velocity))
+
+
+def _with_shepard(terms: RateTerms) -> RateTerms:
+    return RateTerms(terms.continuity, terms.diffusion, terms.concentration, terms.xsph, True, terms.renormalisation)
+
+
+def _filtered(particles: Particles, sums: Rates, dt: Tensor) -> Tensor:
+    """Shepard-filtered density (2.20), taken only by members that really step."""
+    smooth = sums.shepard_mass / sums.shepard_volume - 1.0
+    return torch.where(dt > 0, smooth, particles.deviation)

@@ -1,0 +1,71 @@
+"""What a run did and what went wrong, per ensemble member: failure as data."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from .terms import LIMITS
+
+
+@dataclass
+class Record:
+    """Accounts of a run.  All tensors (members,), counts int64; speeds in m/s.
+
+    Attributes:
+        steps: time steps taken. failed: a non-finite state appeared; the member is frozen at its last good state.
+        smallest_density, largest_density: over time and particles, relative to the rest density.
+        largest_mach: largest |v| / c.
+        outside: particles beyond the wall now, in no open valve.
+        crossed_wall: how often a particle was found beyond the wall and put back.
+        inserted, removed: particles that entered and left, by valve: (members, valves).
+        limited_by: how many steps each limit decided, (members, limits); names in ``terms.LIMITS``.
+        searches: neighbour searches (all members together).
+        work: work of the pressure sources per unit mass density, J m^3/kg; zero without sources.
+    """
+
+    members: int
+    valves: int = 0
+    device: str | torch.device = "cpu"
+    searches: int = 0
+    steps: Tensor = field(init=False)
+    failed: Tensor = field(init=False)
+    smallest_density: Tensor = field(init=False)
+    largest_density: Tensor = field(init=False)
+    largest_mach: Tensor = field(init=False)
+    outside: Tensor = field(init=False)
+    crossed_wall: Tensor = field(init=False)
+    inserted: Tensor = field(init=False)
+    removed: Tensor = field(init=False)
+    limited_by: Tensor = field(init=False)
+    work: Tensor = field(init=False)
+
+    def __post_init__(self) -> None:
+        def counts(*shape: int) -> Tensor:
+            return torch.zeros((self.members, *shape), dtype=torch.int64, device=self.device)
+
+        self.steps, self.outside, self.crossed_wall = counts(), counts(), counts()
+        self.inserted, self.removed, self.limited_by = counts(self.valves), counts(self.valves), counts(len(LIMITS))
+        self.failed = torch.zeros(self.members, dtype=torch.bool, device=self.device)
+        one = torch.ones(self.members, dtype=torch.float64, device=self.device)
+        self.smallest_density, self.largest_density = one.clone(), one.clone()
+        self.largest_mach, self.work = torch.zeros_like(one), torch.zeros_like(one)
+
+    def note_density(self, smallest: Tensor, largest: Tensor) -> None:
+        """Widen the density range by deviations (members,) from the rest density."""
+        self.smallest_density = torch.minimum(self.smallest_density, 1.0 + smallest.double())
+        self.largest_density = torch.maximum(self.largest_density, 1.0 + largest.double())
+
+    def summary(self) -> dict[str, object]:
+        """Plain numbers for metrics files: lists over members."""
+        steps = {name: self.limited_by[:, k].tolist() for k, name in enumerate(LIMITS)}
+        return {
+            "steps": self.steps.tolist(), "failed": self.failed.tolist(),
+            "density_range": [self.smallest_density.tolist(), self.largest_density.tolist()],
+            "largest_mach": self.largest_mach.tolist(), "outside": self.outside.tolist(),
+            "crossed_wall": self.crossed_wall.tolist(), "inserted": self.inserted.tolist(),
+            "removed": self.removed.tolist(), "limited_by": steps, "searches": self.searches,
+            "source_work": self.work.tolist(),
+        }

@@ -1,0 +1,236 @@
+"""Open valves as openings with a buffer of particles behind them, whose flux follows from dV/dt.
+
+The buffer is a straight channel outward of the orifice, a little longer than the kernel's support.  Its particles are
+neighbours of the fluid but move with a prescribed velocity: the orifice's own, plus a profile along its normal scaled
+so that the flux through the orifice equals the rate at which the cavity grows.  A buffer particle that crosses the
+plane inward becomes fluid and is replaced at the far end; a fluid particle that crosses outward becomes buffer, keeps
+its share of the profile, and is removed at the far end.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from .orifice import Orifice, plane_frame, polygon_inset
+from .particles import FLUID, RESERVOIR, Particles
+from .record import Record
+
+if TYPE_CHECKING:
+    from .domain import Domain
+
+# how far beyond the plane (spacings) an outgoing particle changes to buffer, and an incoming one to fluid
+_HYSTERESIS = 0.25
+# depth inside the orifice (spacings) at which the profile of an imposed field is read
+_MOUTH = 0.5
+# samples of dV/dt between key frames; the flux is linear between them
+_FLUX_SAMPLES = 8
+# the ratio of orifice area to the area that the buffer's particles stand for is trusted this far
+_AREA_TRUST = (0.8, 1.25)
+
+
+class Reservoirs:
+    """Buffers behind the valves of a scene; internal units, all members at once."""
+
+    def __init__(self, domain: Domain) -> None:
+        self.domain, self.units = domain, domain.units
+        self.motion = domain.scene.walls
+        self.valves = domain.scene.valves
+        self.flat = domain.scheme.valve.profile == "flat"
+        self.length = float(np.ceil(domain.support_radius) + 1.0)
+        self.times, self.flux = self._flux_table()
+        self._orifices: dict[tuple[int, int], _Frame] = {}
+        self._was_open: tuple[int, ...] = ()
+
+    def _flux_table(self) -> tuple[np.ndarray, np.ndarray]:
+        key = np.asarray(self.motion.time)
+        if len(key) == 1:
+            return key, np.zeros(1)
+        share = np.arange(_FLUX_SAMPLES) / _FLUX_SAMPLES
+        times = np.append((key[:-1, None] + share * np.diff(key)[:, None]).ravel(), key[-1])
+        unit = self.units.length**self.motion.dimension / self.units.time
+        return times, np.array([self.motion.volume_rate(t) for t in times]) / unit
+
+    def inflow(self, times: Tensor) -> Tensor:
+        """dV/dt at times (s), internal: what has to enter through the open valves together."""
+        value = np.interp(times.cpu().numpy(), self.times, self.flux)
+        return torch.as_tensor(value, dtype=self.domain.dtype, device=self.domain.device)
+
+    def _frame(self, region: int) -> _Frame:
+        """The orifice of a region in the middle of the present interval (orifices move little within one)."""
+        time = self.domain.middle
+        label = (region, int(round(time * 1e7)))
+        if label not in self._orifices:
+            if len(self._orifices) > 64:
+                self._orifices.clear()
+            orifice = Orifice.of(self.motion.surface(time), region)
+            self._orifices[label] = _Frame(orifice, self.units.length, self.domain.dtype, self.domain.device)
+        return self._orifices[label]
+
+    def _active(self) -> list[tuple[int, int, _Frame]]:
+        """(number, region, orifice) of the open valves."""
+        chosen = self.domain.open_regions
+        return [(n, v.region, self._frame(v.region)) for n, v in enumerate(self.valves) if v.region in chosen]
+
+    def opened(self, particles: Particles) -> Particles:
+        """Make the buffers of valves that are open and have none, drop those of valves that have shut."""
+        shut = [RESERVOIR + n for n, v in enumerate(self.valves) if v.region not in self.domain.open_regions]
+        if shut:
+            kind = torch.tensor(shut, device=particles.kind.device)
+            stay = ~torch.isin(particles.kind, kind)
+            particles = particles if bool(stay.all()) else particles.select(stay)
+        for number, _, frame in self._active():
+            has = particles.per_member((particles.kind == RESERVOIR + number).to(torch.int64), "sum") > 0
+            empty = torch.nonzero(~has).squeeze(1)
+            if empty.numel():
+                particles = particles.joined(self._buffer(particles, number, frame, empty))
+        return particles
+
+    def _buffer(self, particles: Particles, number: int, frame: _Frame, members: Tensor) -> Particles:
+        """A fresh lattice in the channel of one valve for some members."""
+        place = frame.lattice(self.length)
+        count, copies = place.shape[0], members.numel()
+        mass = torch.stack([particles.mass[particles.member == m].mean() for m in members.tolist()])
+        new = Particles(
+            position=place.repeat(copies, 1), velocity=place.new_zeros((count * copies, place.shape[1])),
+            deviation=self._mouth_deviation(particles, frame, members).repeat_interleave(count),
+            mass=mass.repeat_interleave(count), member=members.repeat_interleave(count),
+            kind=torch.full((count * copies,), RESERVOIR + number, dtype=torch.int64, device=place.device),
+            members=particles.members,
+        )
+        return new
+
+    @staticmethod
+    def _mouth_deviation(particles: Particles, frame: _Frame, members: Tensor) -> Tensor:
+        """Mean density deviation of the fluid near an orifice, per member: what a new buffer starts with."""
+        near = (particles.position - frame.centre).norm(dim=1) < frame.radius
+        weight = (near & particles.fluid).to(particles.deviation.dtype)
+        total = particles.per_member(weight * particles.deviation, "sum")
+        return (total / particles.per_member(weight, "sum").clamp_min(1.0))[members]
+
+    def driven(self, particles: Particles) -> Particles:
+        """Give the buffers' particles their velocity for the present time."""
+        times = self.domain.member_times(particles.members)
+        active = self._active()
+        inflow = self.inflow(times)
+        velocity = particles.velocity
+        for rank, (number, _, frame) in enumerate(active):
+            # several valves at once: filling goes through the first, emptying through the last
+            filling, emptying = rank == 0, rank == len(active) - 1
+            share = inflow.clamp_min(0.0) * filling + inflow.clamp_max(0.0) * emptying
+            row = torch.nonzero(particles.kind == RESERVOIR + number).squeeze(1)
+            owner, old = particles.member[row], velocity[row]
+            along = (old * frame.normal).sum(1)
+            own = self._orifice_velocity(frame)
+            speed = -share / frame.area  # outward
+            target = self._profile(along - (own * frame.normal).sum(), owner, speed, frame, particles)
+            new = own + target[:, None] * frame.normal
+            velocity = velocity.index_copy(0, row, new)
+        return particles.changed(velocity=velocity)
+
+    def _profile(
+        self, along: Tensor, owner: Tensor, speed: Tensor, frame: _Frame, particles: Particles
+    ) -> Tensor:
+        """Scale the buffer's present normal velocities so that their flux is ``speed`` times the orifice's area."""
+        members = speed.shape[0]
+        ones = torch.ones_like(along)
+        shape = ones if self.flat else along.abs()
+
+        def total(values: Tensor) -> Tensor:
+            return values.new_zeros(members).index_add(0, owner, values)
+
+        count, sum_shape = total(ones).clamp_min(1.0), total(shape)
+        mean = sum_shape / count
+        flat = mean < 1e-5
+        mass = particles.mass.mean()
+        occupied = count * mass / self.length
+        wanted = speed * (frame.area / occupied).clamp(*_AREA_TRUST)
+        scale = torch.where(flat, wanted, wanted / mean.clamp_min(1e-5))
+        return torch.where(flat[owner], ones, shape) * scale[owner]
+
+    def _orifice_velocity(self, frame: _Frame) -> Tensor:
+        """Velocity of the orifice itself (D,), from its key-frame motion."""
+        return self.domain.sample_at(frame.centre[None] - 0.0 * frame.normal).velocity[0]
+
+    def exchange(self, particles: Particles, record: Record) -> tuple[Particles, bool]:
+        """Turn particles that have crossed an open orifice into the other kind; feed and clear the far ends."""
+        kind = particles.kind
+        gone = torch.zeros_like(particles.fluid)
+        fresh: list[Particles] = []
+        for number, _, frame in self._active():
+            height = frame.height(particles.position)
+            label = RESERVOIR + number
+            entered = (kind == label) & (height < 0.0)
+            out = particles.fluid & (height > _HYSTERESIS) & (height < self.length)
+            candidates = torch.nonzero(out).squeeze(1)
+            if candidates.numel():
+                over = frame.inset(particles.position[candidates]) > 0
+                out = torch.zeros_like(out).index_put((candidates[over],), torch.ones_like(over[over]))
+            far = (kind == label) & (height > self.length)
+            if bool(entered.any()):
+                copy = particles.select(entered)
+                fresh.append(copy.changed(position=copy.position + self.length * frame.normal))
+            kind = torch.where(entered, torch.full_like(kind, FLUID), kind)
+            kind = torch.where(out, torch.full_like(kind, label), kind)
+            gone |= far
+            for counter, which in ((record.inserted, entered), (record.removed, out)):
+                counter[:, number] += particles.per_member(which.to(torch.int64), "sum")
+        changed = bool(fresh) or bool(gone.any())
+        if not changed and kind is particles.kind:
+            return particles, False
+        particles = particles.changed(kind=kind)
+        if not changed:
+            return particles, False
+        particles = particles.select(~gone)
+        for copy in fresh:
+            particles = particles.joined(copy)
+        return particles, True
+
+    def mouth_points(self, particles: Particles) -> Tensor:
+        """Where to look up an imposed field (N, D): fluid particles at their place, buffers just inside the orifice.
+
+        A buffer so takes on the velocity profile that the field has at the orifice.
+        """
+        points = particles.position
+        for number, _, frame in self._active():
+            height = frame.height(points)
+            inward = (-height - _MOUTH)[:, None] * frame.normal
+            points = torch.where((particles.kind == RESERVOIR + number)[:, None], points + inward, points)
+        return points
+
+
+class _Frame:
+    """An orifice in internal units on the device."""
+
+    def __init__(self, orifice: Orifice, length: float, dtype: torch.dtype, device: str) -> None:
+        def tensor(value: np.ndarray) -> Tensor:
+            return torch.as_tensor(np.ascontiguousarray(value), dtype=dtype, device=device)
+
+        self.centre, self.normal = tensor(orifice.centre / length), tensor(orifice.normal)
+        basis = plane_frame(orifice.normal)
+        self.basis = tensor(basis)
+        self.rim = tensor((orifice.rim - orifice.centre) / length @ basis)
+        self.area = float(orifice.area / length ** len(orifice.normal.reshape(-1)[1:]))
+        self.radius = float(self.rim.reshape(-1, self.rim.shape[-1]).norm(dim=1).max())
+
+    def height(self, position: Tensor) -> Tensor:
+        """Outward distance from the plane, (n,)."""
+        return (position - self.centre) @ self.normal
+
+    def inset(self, position: Tensor) -> Tensor:
+        """In-plane distance from the rim, (n,), positive over the opening."""
+        return polygon_inset((position - self.centre) @ self.basis, self.rim)
+
+    def lattice(self, length: float) -> Tensor:
+        """Unit lattice in the channel of the given length behind the opening, (n, D)."""
+        reach = int(np.ceil(self.radius)) + 1
+        axis = torch.arange(-reach, reach, dtype=self.centre.dtype, device=self.centre.device) + 0.5
+        flat = torch.cartesian_prod(*[axis] * self.basis.shape[1]).reshape(-1, self.basis.shape[1])
+        flat = flat[polygon_inset(flat, self.rim) > 0]
+        layers = torch.arange(int(length), dtype=flat.dtype, device=flat.device) + 0.5
+        place = flat @ self.basis.T
+        columns = place[:, None, :] + layers[None, :, None] * self.normal
+        return self.centre + columns.reshape(-1, self.centre.shape[0])

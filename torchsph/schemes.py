@@ -1,0 +1,181 @@
+"""How a scene is stepped: the options of the weakly compressible scheme and its presets."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+from .pairs.interface import CONTINUITY_FORMS, PRESSURE_FORMS
+from .smoothing import kernel
+
+
+@dataclass(frozen=True)
+class XSPH:
+    """XSPH (2.33): neighbours' velocities pull with strength ``epsilon``.
+
+    ``level`` is "velocity" (2.34: the momentum itself is smoothed, as in the thesis; strongly dissipative) or
+    "position" (Monaghan 1989: only the motion of the particles).
+    """
+
+    epsilon: float = 0.2
+    level: str = "velocity"
+
+    def __post_init__(self) -> None:
+        if not 0 < self.epsilon <= 1:
+            raise ValueError(f"XSPH epsilon must lie in (0, 1], got {self.epsilon}")
+        if self.level not in ("velocity", "position"):
+            raise ValueError(f"XSPH level must be 'velocity' or 'position', got '{self.level}'")
+
+
+@dataclass(frozen=True)
+class PotentialWall:
+    """The thesis's wall (3.1, 3.2): potential U(s) = stiffness c^2 s^2 / 2 with s = 1 - d / reach for d < reach.
+
+    Attributes:
+        stiffness: wall potential at d = 0 in units of c^2 / 2.
+        reach: distance at which the potential starts, in particle spacings.
+        relaxation: time constant tau of the no-slip retardation at the wall, in reach / c; None: free slip. The factor
+            per step is xi = 1 - exp(-dt / tau * s), applied to the tangential velocity relative to the wall.
+    """
+
+    stiffness: float = 0.2
+    reach: float = 1.0
+    relaxation: float | None = 1.0
+
+    def __post_init__(self) -> None:
+        if not self.stiffness > 0 or not self.reach > 0:
+            raise ValueError(f"PotentialWall needs positive stiffness and reach, got {self.stiffness}, {self.reach}")
+        if self.relaxation is not None and not self.relaxation > 0:
+            raise ValueError(f"PotentialWall.relaxation must be positive or None, got {self.relaxation}")
+
+
+@dataclass(frozen=True)
+class CompleteKernelWall:
+    """Wall by the analytic kernel integrals behind it (Ferrand et al. 2013): no wall particles, one look-up each.
+
+    Attributes:
+        no_slip: laminar friction with the wall (True) or free slip.
+        gap: particles are kept this far inside the wall, in particle spacings.
+    """
+
+    no_slip: bool = True
+    gap: float = 0.05
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.gap < 0.5:
+            raise ValueError(f"CompleteKernelWall.gap must lie in [0, 0.5), got {self.gap}")
+
+
+@dataclass(frozen=True)
+class PressureSource:
+    """A timed pressure source at an open valve (3.3, 3.4), softened inside ``core``.
+
+    The strength Q follows from continuity: the acceleration that changes the flux through the orifice as the volume of
+    the cavity demands, spread over a half-sphere around the orifice. ``core`` is in orifice radii.
+    """
+
+    core: float = 0.5
+
+    def __post_init__(self) -> None:
+        if not self.core > 0:
+            raise ValueError(f"PressureSource.core must be positive, got {self.core}")
+
+
+@dataclass(frozen=True)
+class Reservoir:
+    """An open valve as an opening with a buffer of particles behind it whose flux follows from dV/dt.
+
+    ``profile`` is "field" (the velocity profile of the imposed field, flat where it has none) or "flat".
+    """
+
+    profile: str = "field"
+
+    def __post_init__(self) -> None:
+        if self.profile not in ("field", "flat"):
+            raise ValueError(f"Reservoir.profile must be 'field' or 'flat', got '{self.profile}'")
+
+
+@dataclass(frozen=True)
+class WeaklyCompressible:
+    """Weakly compressible SPH with an equation of state; None switches a term off.
+
+    Attributes:
+        kernel: name of the smoothing kernel.
+        smoothing_ratio: smoothing length h over particle spacing.
+        sound_speed: numerical speed of sound, m/s.
+        gamma: exponent of the Tait equation (2.25).
+        background_pressure: p0 / rho0 in units of c^2 (0: none).
+        continuity: "volume" or "mass" (2.19) form of the density rate.
+        pressure: form of the pressure force (``MomentumTerms``).
+        artificial_viscosity: alpha of 2.29, or None.
+        laminar_viscosity: whether the viscosity of the scene's fluid acts (Morris et al. 1997).
+        density_diffusion: delta of delta-SPH (Molteni & Colagrossi 2009), or None.
+        xsph: velocity smoothing, or None.
+        shifting: strength of the particle shifting (Lind et al. 2012 with the speed of the particle), or None.
+        bulk_damping: coefficient of a pressure -b c h div v that damps sound, or None.
+        shepard_period: steps between Shepard filters of the density (2.20), or None.
+        wall: wall model for scenes with walls; valve: valve model for scenes with valves (None: stays shut).
+        order: "thesis" steps as algorithm 1; "symplectic" evaluates both passes at one position.
+        courant: fraction of the acoustic limit h / (c + v), of h^2/(8 nu) and of sqrt(h / |a|) / 2.
+        steps_per_frame: at least so many steps between imposed frames, or None.
+    """
+
+    kernel: str = "wendland_c2"
+    smoothing_ratio: float = 1.3
+    sound_speed: float = 5.0
+    gamma: float = 1.0
+    background_pressure: float = 0.0
+    continuity: str = "volume"
+    pressure: str = "switched"
+    artificial_viscosity: float | None = 0.02
+    laminar_viscosity: bool = True
+    density_diffusion: float | None = 0.1
+    xsph: XSPH | None = None
+    shifting: float | None = 0.5
+    bulk_damping: float | None = 0.3
+    shepard_period: int | None = None
+    wall: PotentialWall | CompleteKernelWall = field(default_factory=CompleteKernelWall)
+    valve: PressureSource | Reservoir | None = field(default_factory=Reservoir)
+    order: str = "symplectic"
+    courant: float = 0.35
+    steps_per_frame: int | None = None
+
+    def __post_init__(self) -> None:
+        kernel(self.kernel)
+        for name in ("smoothing_ratio", "sound_speed", "gamma", "courant"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"WeaklyCompressible.{name} must be positive, got {getattr(self, name)}")
+        for name in ("artificial_viscosity", "density_diffusion", "shifting", "bulk_damping", "background_pressure"):
+            value = getattr(self, name)
+            if value is not None and not value >= 0:
+                raise ValueError(f"WeaklyCompressible.{name} must not be negative, got {value}")
+        for name, known in (
+            ("continuity", CONTINUITY_FORMS), ("pressure", PRESSURE_FORMS), ("order", ("thesis", "symplectic")),
+        ):
+            if getattr(self, name) not in known:
+                raise ValueError(f"WeaklyCompressible.{name} must be one of {known}, got '{getattr(self, name)}'")
+        for name in ("shepard_period", "steps_per_frame"):
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise ValueError(f"WeaklyCompressible.{name} must be at least 1 or None, got {value}")
+
+
+# 16 particles per cell of table 4.1 put a spacing at cell / 16^(1/3); the support of the truncated Gaussian (delta 3)
+# is one cell, so h = cell / 3
+_THESIS_RATIO = 16 ** (1 / 3) / 3
+
+PRESETS: dict[str, WeaklyCompressible] = {
+    "default": WeaklyCompressible(),
+    "thesis": WeaklyCompressible(
+        kernel="gaussian", smoothing_ratio=_THESIS_RATIO, sound_speed=5.0, gamma=3.0, background_pressure=0.2,
+        continuity="mass", pressure="symmetric", artificial_viscosity=0.5, laminar_viscosity=False,
+        density_diffusion=None, xsph=XSPH(0.2, "velocity"), shifting=None, bulk_damping=None, shepard_period=50,
+        wall=PotentialWall(), valve=PressureSource(), order="thesis", steps_per_frame=100,
+    ),
+}
+
+
+def preset(name: str, **changes: object) -> WeaklyCompressible:
+    """The preset called ``name`` ("default", or "thesis" = table 4.1), with some options changed."""
+    if name not in PRESETS:
+        raise ValueError(f"unknown preset '{name}'; known: {', '.join(sorted(PRESETS))}")
+    return replace(PRESETS[name], **changes) if changes else PRESETS[name]

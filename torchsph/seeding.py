@@ -1,0 +1,183 @@
+"""Where the particles start: the thesis's Boltzmann sampling, or a packed, relaxed quiet start."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from .pairs.interface import PairState, RateTerms, Support
+from .particles import FLUID, Particles
+from .schemes import CompleteKernelWall, PotentialWall
+from .smoothing import kernel
+from .walls import WallSample, potential
+
+if TYPE_CHECKING:
+    from .simulator import Simulator
+
+_TRIES = 200
+_LARGEST_MOVE = 0.1
+# lattice points closer to the wall than this are left out; 0 would give exactly the rest density, but starts crowded
+_CUT = 0.1
+_CLEARANCE = 0.2
+
+
+@dataclass(frozen=True)
+class Seeding:
+    """How particles are placed.
+
+    Attributes:
+        kind: "boltzmann": random positions accepted with exp(-(U - U0) / T) (section 3.1.4 and its erratum);
+            "quiet": a lattice cut by the walls, then relaxed until the crowding gradient is small.
+        temperature: T in units of the wall potential at d = 0 (boltzmann).
+        relaxations: sweeps of the quiet start.
+        jitter: random displacement of lattice points, in spacings (quiet).
+    """
+
+    kind: str = "quiet"
+    temperature: float = 0.1
+    relaxations: int = 30
+    jitter: float = 0.02
+
+    def __post_init__(self) -> None:
+        if self.kind not in ("boltzmann", "quiet"):
+            raise ValueError(f"Seeding.kind must be 'boltzmann' or 'quiet', got '{self.kind}'")
+        if not self.temperature > 0 or self.relaxations < 0 or not 0 <= self.jitter < 0.5:
+            raise ValueError(
+                "Seeding needs temperature > 0, relaxations >= 0 and 0 <= jitter < 0.5, got "
+                f"{self.temperature}, {self.relaxations}, {self.jitter}"
+            )
+
+
+def seed_particles(simulator: Simulator, time: float, generator: torch.Generator) -> Particles:
+    """One member of resting fluid at rest density that fills the scene's walls, or its periodic box, at ``time`` (s).
+
+    Raises ValueError where the scene has neither, or where the spacing leaves no room for a particle.
+    """
+    domain = simulator.domain
+    soft = isinstance(simulator.scheme.wall, PotentialWall)
+    seeding = simulator.seeding or Seeding("boltzmann" if soft and domain.walls is not None else "quiet")
+    if domain.walls is None:
+        position = _box_lattice(simulator, seeding, generator)
+        return _resting(position, torch.ones_like(position[:, 0]))
+    domain.enter(time, time, shut=True)
+    lower, upper = _wall_box(simulator, time)
+    place = _boltzmann if seeding.kind == "boltzmann" else _quiet
+    position = place(simulator, seeding, lower, upper, generator)
+    if position.shape[0] == 0:
+        raise ValueError(
+            f"no particle of spacing {simulator.scene.spacing:g} m fits inside the walls at {time:g} s; use a finer "
+            "spacing"
+        )
+    volume = simulator.scene.walls.volume(time) / simulator.scene.spacing**simulator.scene.dimension
+    mass = torch.full_like(position[:, 0], volume / position.shape[0])
+    return _resting(position, mass)
+
+
+def _resting(position: Tensor, mass: Tensor) -> Particles:
+    count = position.shape[0]
+    label = torch.zeros(count, dtype=torch.int64, device=position.device)
+    return Particles(position, torch.zeros_like(position), torch.zeros_like(mass), mass, label, label + FLUID, 1)
+
+
+def _wall_box(simulator: Simulator, time: float) -> tuple[Tensor, Tensor]:
+    vertices = torch.as_tensor(simulator.scene.walls.vertices(time), dtype=simulator.dtype, device=simulator.device)
+    vertices = vertices / simulator.scene.spacing
+    return vertices.amin(0), vertices.amax(0)
+
+
+def _box_lattice(simulator: Simulator, seeding: Seeding, generator: torch.Generator) -> Tensor:
+    period = simulator.domain.period
+    if period is None or not bool(torch.isfinite(period).all()):
+        raise ValueError("a scene without walls must be periodic in every direction to be seeded; else use resume()")
+    counts = [round(float(p)) for p in period]
+    for length, count in zip(period.tolist(), counts, strict=True):
+        if abs(length - count) > 1e-3 * length:
+            raise ValueError(f"a period of {length:g} spacings is not a whole number; change Scene.spacing")
+    position = _lattice(torch.zeros_like(period), counts)
+    return position + seeding.jitter * (2 * _uniform(position, generator) - 1)
+
+
+def _lattice(origin: Tensor, counts: list[int]) -> Tensor:
+    axes = [origin[k] + torch.arange(n, device=origin.device, dtype=origin.dtype) + 0.5 for k, n in enumerate(counts)]
+    return torch.cartesian_prod(*axes)
+
+
+def _uniform(like: Tensor, generator: torch.Generator) -> Tensor:
+    return torch.rand(like.shape, generator=generator, dtype=like.dtype, device=like.device)
+
+
+def _boltzmann(
+    simulator: Simulator, seeding: Seeding, lower: Tensor, upper: Tensor, generator: torch.Generator
+) -> Tensor:
+    """As many particles as rest volumes fit, one random try per unit cell and sweep (thesis 3.1.4).
+
+    U0 is the potential of the free interior, 0. Points beyond the wall are refused whatever their potential.
+    """
+    model = simulator.scheme.wall
+    if not isinstance(model, PotentialWall):
+        raise ValueError("Boltzmann seeding needs a potential wall; use Seeding(kind='quiet')")
+    sound = simulator.scheme.sound_speed / simulator.domain.units.speed
+    scale = seeding.temperature * 0.5 * model.stiffness * sound**2
+    origin = torch.floor(lower)
+    counts = (torch.ceil(upper) - origin).to(torch.int64).tolist()
+    corner = _lattice(origin, counts) - 0.5
+    # a vectorised sweep over cells, repeated where the try was refused, keeps about one particle per cell
+    wall = domain_sample(simulator, corner + 0.5)
+    open_cells = torch.nonzero(wall.distance > 0).squeeze(1)
+    chosen = []
+    for _ in range(_TRIES):
+        if open_cells.numel() == 0:
+            break
+        trial = corner[open_cells] + _uniform(corner[open_cells], generator)
+        wall = domain_sample(simulator, trial)
+        chance = torch.exp(-potential(model, sound, wall) / scale) * (wall.distance > 0)
+        taken = torch.rand(chance.shape, generator=generator, dtype=chance.dtype, device=chance.device) < chance
+        chosen.append(trial[taken])
+        open_cells = open_cells[~taken]
+    return torch.cat(chosen) if chosen else corner[:0]
+
+
+def domain_sample(simulator: Simulator, position: Tensor) -> WallSample:
+    """Walls at points (n, D), internal, at the time the domain has entered."""
+    return simulator.domain.sample_at(position)
+
+
+def _quiet(
+    simulator: Simulator, seeding: Seeding, lower: Tensor, upper: Tensor, generator: torch.Generator
+) -> Tensor:
+    """A lattice inside the walls, relaxed by shifting down the crowding gradient (Colagrossi et al. 2012)."""
+    counts = (torch.ceil(upper - lower) + 1).to(torch.int64).tolist()
+    position = _lattice(lower - 0.25, counts)
+    position = position + seeding.jitter * (2 * _uniform(position, generator) - 1)
+    position = position[domain_sample(simulator, position).distance > _CUT]
+    if position.shape[0] == 0 or not isinstance(simulator.scheme.wall, CompleteKernelWall):
+        return position
+    volume = simulator.scene.walls.volume(simulator.domain.middle) / simulator.scene.spacing ** position.shape[1]
+    return relaxed(simulator, position, volume / position.shape[0], seeding.relaxations)
+
+
+def relaxed(simulator: Simulator, position: Tensor, mass: float, sweeps: int) -> Tensor:
+    """Move particles of volume ``mass`` (internal) down the gradient of their crowding, kept off the walls."""
+    from .integrate import PairSearch
+    from .pairs import backend as choose_backend
+
+    scheme = simulator.scheme
+    support = Support(kernel(scheme.kernel), scheme.smoothing_ratio, position.shape[1])
+    search = PairSearch(
+        choose_backend(simulator.backend, simulator.device), support.radius, 0.5, simulator.domain.period
+    )
+    for _ in range(sweeps):
+        particles = _resting(position, torch.full_like(position[:, 0], mass))
+        state: PairState = particles.state(particles.deviation)
+        terms = RateTerms(continuity=None, concentration=True)
+        crowding = search.backend.rates(search.at(particles), state, support, terms).concentration
+        wall = domain_sample(simulator, position)
+        move = -0.15 * scheme.smoothing_ratio**2 * (crowding - wall.share_gradient)
+        length = move.norm(dim=1, keepdim=True)
+        position = position + move * (_LARGEST_MOVE / length.clamp_min(_LARGEST_MOVE))
+        wall = domain_sample(simulator, position)
+        position = position + (_CLEARANCE - wall.distance).clamp_min(0.0)[:, None] * wall.normal
+    return position

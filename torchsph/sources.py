@@ -1,0 +1,85 @@
+"""Open valves as timed pressure sources (thesis 3.3, 3.4), softened at the source."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from .orifice import Orifice
+from .particles import Particles
+from .record import Record
+from .scene import Scene
+from .schemes import PressureSource
+from .units import Units
+
+
+class Sources:
+    """Potential V = Q / r around the centre of each open orifice, with Q from continuity.
+
+    The flux q(t) = dV/dt through the orifice, spread over a half-sphere around its centre, has the radial speed
+    q / (2 pi r^2); changing it needs the acceleration (dq/dt) / (2 pi r^2) towards the cavity, so Q = dq/dt / (2 pi)
+    in 3.4 (in a plane: half-circle, dq/dt / (pi r)). A core radius replaces r by sqrt(r^2 + core^2).
+    """
+
+    def __init__(
+        self, scene: Scene, model: PressureSource, units: Units, device: str, dtype: torch.dtype
+    ) -> None:
+        self.motion, self.units, self.dtype, self.device = scene.walls, units, dtype, device
+        self.valves = scene.valves
+        self._core: dict[int, float] = {}
+        self._track: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+        for valve in scene.valves:
+            orifices = [Orifice.of(self.motion.surface(t), valve.region) for t in self.motion.time]
+            area = float(np.mean([o.area for o in orifices]))
+            radius = math.sqrt(area / math.pi) if scene.dimension == 3 else 0.5 * area
+            self._core[valve.region] = model.core * radius / units.length
+            centre = np.stack([o.centre for o in orifices]) / units.length
+            self._track[valve.region] = (centre, np.stack([o.normal for o in orifices]))
+        self.dimension = scene.dimension
+
+    def strength(self, time: float) -> float:
+        """d^2 V / dt^2 of the cavity (m^3/s^2), by central differences of the exact dV/dt over a millisecond."""
+        step = 1e-3
+        first, last = float(self.motion.time[0]), float(self.motion.time[-1])
+        early, late = max(time - step, first), min(time + step, last)
+        if late <= early:
+            return 0.0
+        return (self.motion.volume_rate(late) - self.motion.volume_rate(early)) / (late - early)
+
+    def acceleration(self, particles: Particles, open_regions: tuple[int, ...], times: Tensor) -> Tensor:
+        """-grad V (3.4) of the open valves at the particles, (N, D), internal."""
+        time = float(times.mean()) if times.numel() else 0.0
+        unit = self.units.length**self.dimension / self.units.time**2
+        share = self.strength(time) / unit / len(open_regions)
+        total = torch.zeros_like(particles.position)
+        for region in open_regions:
+            offset = particles.position - self._at(region, time, 0)
+            square = (offset * offset).sum(1, keepdim=True) + self._core[region] ** 2
+            if self.dimension == 3:
+                total = total + share / (2.0 * math.pi) * offset / square**1.5
+            else:
+                total = total + share / math.pi * offset / square
+        return total
+
+    def without_gone(
+        self, particles: Particles, open_regions: tuple[int, ...], time: float, record: Record
+    ) -> Particles:
+        """Take out the particles that are more than a spacing beyond an open orifice, and count them."""
+        gone = torch.zeros(particles.count, dtype=torch.bool, device=particles.position.device)
+        for number, valve in enumerate(self.valves):
+            if valve.region not in open_regions:
+                continue
+            height = ((particles.position - self._at(valve.region, time, 0)) * self._at(valve.region, time, 1)).sum(1)
+            out = (height > 1.0) & ~gone
+            record.removed[:, number] += particles.per_member(out.to(torch.int64), "sum")
+            gone |= out
+        return particles.select(~gone) if bool(gone.any()) else particles
+
+    def _at(self, region: int, time: float, which: int) -> Tensor:
+        """Centre (which 0, internal) or outward normal (1) of an orifice, linear in time between key frames."""
+        track = self._track[region][which]
+        row = np.array([np.interp(time, self.motion.time, track[:, k]) for k in range(track.shape[1])])
+        return torch.as_tensor(row, dtype=self.dtype, device=self.device)
