@@ -4,16 +4,32 @@ An ensemble is `(*batch, N, n)`; `predicted (*batch, N, m)` is the observation o
 filter here is a `Filter`: `analyse(ensemble, predicted, observations, ...) -> Analysis`.
 """
 
+from .diagnostics import (
+    InnovationStatistics,
+    chi2_band,
+    crps,
+    desroziers,
+    effective_size,
+    nees,
+    rank_histogram,
+    spread_skill,
+)
 from .enkf import StochasticEnKF
 from .errors import AssimilationError
 from .etkf import ETKF
+from .failures import Replacement, replace_failed
 from .filters import Analysis, EnsembleFilter, Filter, GlobalTransform, Transform, check_ensemble
 from .inflation import RTPP, RTPS, Adaptive, Inflation, Multiplicative
 from .letkf import LETKF, LocalTransform
 from .localisation import Localisation, gaspari_cohn
 from .observations import Observations, Reason, Screened, concatenate, count_reasons, screen
+from .record import FilterRecord
+from .reduced_unscented import ReducedUnscented
 from .rotation import random_rotation
+from .sigma import SigmaPoints, Simplex, Symmetric, draw_points
+from .smoother import FixedLagSmoother
 from .subspace import ErrorSubspace, update_weights, zero_sum_basis
+from .unscented import UnscentedFilter, UnscentedUpdate
 
 __all__ = [
     "ETKF",
@@ -26,22 +42,41 @@ __all__ = [
     "EnsembleFilter",
     "ErrorSubspace",
     "Filter",
+    "FilterRecord",
+    "FixedLagSmoother",
     "GlobalTransform",
     "Inflation",
+    "InnovationStatistics",
     "LocalTransform",
     "Localisation",
     "Multiplicative",
     "Observations",
     "Reason",
+    "ReducedUnscented",
+    "Replacement",
     "Screened",
+    "SigmaPoints",
+    "Simplex",
     "StochasticEnKF",
+    "Symmetric",
     "Transform",
+    "UnscentedFilter",
+    "UnscentedUpdate",
     "check_ensemble",
+    "chi2_band",
     "concatenate",
     "count_reasons",
+    "crps",
+    "desroziers",
+    "draw_points",
+    "effective_size",
     "gaspari_cohn",
+    "nees",
     "random_rotation",
+    "rank_histogram",
+    "replace_failed",
     "screen",
+    "spread_skill",
     "update_weights",
     "zero_sum_basis",
 ]

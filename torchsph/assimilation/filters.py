@@ -27,6 +27,7 @@ class Analysis:
     Attributes:
         ensemble: `(*batch, N, n)`, dtype of the forecast.
         mean: `(*batch, n)`, the estimate; for most filters the members' average.
+        variance: `(*batch, n)`, the error variance of `mean` that the filter claims.
         reason: `(*batch, m)` uint8 `Reason` codes, 0 = used.
         innovation: `(*batch, m)` float64, observation minus mean prediction; NaN where there is none.
         innovation_variance: `(*batch, m)` float64, what the innovation's variance should be: predicted
@@ -36,11 +37,13 @@ class Analysis:
         prior_factor: factor on the forecast's spread that was used, scalar or `(*batch,)`.
         spread_before, spread_after: `(*batch,)` root mean variance over the state.
         transform: the linear map of members that was applied; a smoother applies it to earlier states.
+        rotation: `(*batch, N, N)` applied to the anomalies after it, or None.
         warnings: in words, empty when all is well.
     """
 
     ensemble: Tensor
     mean: Tensor
+    variance: Tensor
     reason: Tensor
     innovation: Tensor
     innovation_variance: Tensor
@@ -49,6 +52,7 @@ class Analysis:
     spread_before: Tensor
     spread_after: Tensor
     transform: Transform
+    rotation: Tensor | None = None
     warnings: tuple[str, ...] = field(default=())
 
     def counts(self) -> dict[str, int]:
@@ -83,10 +87,7 @@ class Filter(Protocol):
 
 
 class Transform(Protocol):
-    """A linear map of members; `reached (n,)` marks numbers it may change, None for all.
-
-    `rotation (*batch, N, N)`, if any, is applied after it.
-    """
+    """A linear map of members; `reached`, broadcastable to `(*batch, N, n)`, marks what it may change."""
 
     reached: Tensor | None
 
@@ -161,9 +162,8 @@ class EnsembleFilter(ABC):
         """See `Filter.analyse`. Raises `AssimilationError` on shapes that do not fit and on NaN members."""
         check_ensemble(ensemble, predicted, observations)
         wide = predicted.double()
-        mean = wide.mean(-2)
-        variance = (wide - mean.unsqueeze(-2)).square().sum(-2) / (wide.shape[-2] - 1)
-        screened = screen(observations, mean, variance, self.gross_error)
+        mean = self._mean(wide)
+        screened = screen(observations, mean, self._variance(wide), self.gross_error)
         factor = torch.as_tensor(1.0, dtype=torch.float64)
         for part in self._inflations():
             factor = factor * part.prior_factor(screened)
@@ -171,11 +171,14 @@ class EnsembleFilter(ABC):
         anomalies = torch.where(screened.used.unsqueeze(-2), anomalies, 0.0)
         state = (ensemble.shape[-1], state_positions)
         transform, signal, reason = self._transform(anomalies, screened, observations, state, generator)
-        analysed = self._finish(ensemble, factor, transform, generator)
-        before, after = _spread(ensemble), _spread(analysed)
+        rotation = self._rotation(ensemble, generator)
+        analysed = self._finish(ensemble.double(), factor, transform, rotation)
+        variance = self._variance(analysed)
+        before, after = self._variance(ensemble.double()).mean(-1).sqrt(), variance.mean(-1).sqrt()
         return Analysis(
-            ensemble=analysed,
-            mean=analysed.double().mean(-2).to(ensemble.dtype),
+            ensemble=analysed.to(ensemble.dtype),
+            mean=self._mean(analysed).to(ensemble.dtype),
+            variance=variance.to(ensemble.dtype),
             reason=reason,
             innovation=(observations.value.double() - mean),
             innovation_variance=screened.predicted_variance * _column(factor, 1) ** 2 + screened.variance,
@@ -184,34 +187,47 @@ class EnsembleFilter(ABC):
             spread_before=before,
             spread_after=after,
             transform=transform,
-            warnings=_warnings(before, reason),
+            rotation=rotation,
+            warnings=_warnings(ensemble, before, reason),
         )
+
+    def _mean(self, points: Tensor) -> Tensor:
+        """`(*batch, k)` estimate from members `(*batch, N, k)`; equal weights unless a method says
+        otherwise.
+        """
+        return points.mean(-2)
+
+    def _variance(self, points: Tensor) -> Tensor:
+        """`(*batch, k)` error variance from members `(*batch, N, k)`, divisor N - 1."""
+        anomalies = points - points.mean(-2, keepdim=True)
+        return anomalies.square().sum(-2) / (points.shape[-2] - 1)
 
     def _inflations(self) -> tuple[Inflation, ...]:
         if self.inflation is None:
             return ()
         return self.inflation if isinstance(self.inflation, tuple) else (self.inflation,)
 
+    def _rotation(self, ensemble: Tensor, generator: torch.Generator | None) -> Tensor | None:
+        if not self.rotation:
+            return None
+        draw = need_generator(generator, "rotation")
+        batch = tuple(ensemble.shape[:-2])
+        return random_rotation(ensemble.shape[-2], draw, batch=batch, device=ensemble.device)
+
     def _finish(
-        self, ensemble: Tensor, factor: Tensor, transform: Transform, generator: torch.Generator | None
+        self, ensemble: Tensor, factor: Tensor, transform: Transform, rotation: Tensor | None
     ) -> Tensor:
-        """Prior inflation, transform, posterior inflation and rotation of the state."""
-        mean = ensemble.double().mean(-2, keepdim=True)
-        prior = ensemble.double() - mean
-        inflated = mean + prior * _column(factor, 2)
-        analysed = transform.apply(inflated)
+        """Prior inflation, transform, posterior inflation and rotation of the state, float64."""
+        mean = self._mean(ensemble).unsqueeze(-2)
+        prior = ensemble - mean
+        analysed = transform.apply(mean + prior * _column(factor, 2))
         if transform.reached is not None:
-            analysed = torch.where(transform.reached, analysed, mean + prior)
-        mean = analysed.mean(-2, keepdim=True)
+            analysed = torch.where(transform.reached, analysed, ensemble)
+        mean = self._mean(analysed).unsqueeze(-2)
         posterior = analysed - mean
         for part in self._inflations():
             posterior = part.relax(prior, posterior, transform.reached)
-        if self.rotation:
-            draw = need_generator(generator, "rotation")
-            batch = tuple(ensemble.shape[:-2])
-            matrix = random_rotation(ensemble.shape[-2], draw, batch=batch, device=ensemble.device)
-            posterior = matrix @ posterior
-        return (mean + posterior).to(ensemble.dtype)
+        return mean + (posterior if rotation is None else rotation @ posterior)
 
 
 def check_ensemble(ensemble: Tensor, predicted: Tensor, observations: Observations) -> None:
@@ -240,13 +256,10 @@ def _column(factor: Tensor, extra: int) -> Tensor:
     return factor.reshape(*factor.shape, *([1] * extra)) if factor.ndim else factor
 
 
-def _spread(ensemble: Tensor) -> Tensor:
-    return ensemble.double().var(-2).mean(-1).sqrt()
-
-
-def _warnings(spread: Tensor, reason: Tensor) -> tuple[str, ...]:
+def _warnings(ensemble: Tensor, spread: Tensor, reason: Tensor) -> tuple[str, ...]:
     words = []
-    if bool((spread == 0).any()):
+    size = ensemble.double().square().mean((-2, -1)).sqrt()
+    if bool((spread <= torch.finfo(ensemble.dtype).eps * size).any()):
         words.append("the ensemble has collapsed to one state: observations cannot change it")
     if reason.numel() and not bool((reason == 0).any()):
         words.append("no observation was used in this cycle: the analysis is the forecast")
