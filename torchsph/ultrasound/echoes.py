@@ -1,0 +1,94 @@
+"""A packet of IQ images of a flow: scatterers moved, imaged and drowned in thermal noise."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import torch
+
+from geometry import Grid
+
+from .acquisition import Acquisition, Beams, Packet
+from .flow import Flow
+from .image import ParallelImager
+from .pointspread import GaussianPointSpread, PointSpread
+from .scatterers import Box, Cloud, advance, reseed, seed_cloud
+
+
+@dataclass(frozen=True)
+class EchoModel:
+    """Options of :func:`simulate_packet`.
+
+    snr: blood speckle power over thermal noise power, dB; ``None`` = no noise.
+    tissue: echogenicity of tissue over blood, dB; ``None`` = tissue is silent.
+    clutter: stationary echo power over blood power inside the blood (reverberation, side lobes), dB;
+        ``None`` = none. ``clutter_velocity``, m/s, lets it move (D numbers, ``None`` = still).
+    density: scatterers per volume sqrt-integral of the point spread; 5 with
+        Gaussian amplitudes give fully developed speckle.
+    """
+
+    acquisition: Acquisition = Acquisition()
+    pointspread: PointSpread = field(default_factory=GaussianPointSpread)
+    beams: Beams = Beams()
+    snr: float | None = 20.0
+    tissue: float | None = 40.0
+    clutter: float | None = None
+    clutter_velocity: tuple[float, ...] | None = None
+    density: float = 5.0
+
+    def __post_init__(self) -> None:
+        for name in ("snr", "tissue", "clutter"):
+            value = getattr(self, name)
+            if value is not None and not math.isfinite(value):
+                raise ValueError(f"{name} must be a finite number of dB or None, got {value!r}")
+        if not (math.isfinite(self.density) and self.density > 0):
+            raise ValueError(f"density must be positive, got {self.density!r}")
+
+
+def simulate_packet(
+    flow: Flow, grid: Grid, model: EchoModel, time: float, generator: torch.Generator,
+    *, dtype: torch.dtype = torch.float32,
+) -> Packet:  # fmt: skip
+    """IQ images of ``flow`` on ``grid``, centred in time on ``time`` (s), of blood power 1.
+
+    Scatterers are seeded afresh at the first image and reseeded at every following one where they leave or thin
+    out. Runs on the generator's device. Raises ValueError where dimensions disagree.
+    """
+    if model.beams.dimension != grid.dimension:
+        raise ValueError(f"beams are {model.beams.dimension}-D, the grid {grid.dimension}-D")
+    acquisition = model.acquisition
+    imager = ParallelImager(grid, model.pointspread, acquisition, model.beams, dtype=dtype, device=generator.device)
+    box, density = _box(grid, model), model.density / model.pointspread.energy(grid.dimension)
+    start = time - 0.5 * (acquisition.packet - 1) * acquisition.interval
+    cloud = seed_cloud(box, flow, start, density, generator, dtype=dtype)
+    haze = None if model.clutter is None else seed_cloud(box, flow, start, density, generator, dtype=dtype)
+    # density * energy(h) is the speckle power of unit amplitudes, so this makes the blood's power 1
+    scale = 1 / math.sqrt(density * model.pointspread.energy(grid.dimension))
+    noise = 0.0 if model.snr is None else 10 ** (-model.snr / 10)
+    images = []
+    for number in range(acquisition.packet):
+        now = start + number * acquisition.interval
+        iq = imager.image(cloud.position, _echogenicity(cloud, model) * scale)
+        if haze is not None:
+            shift = haze.position.new_tensor(model.clutter_velocity or (0.0,) * grid.dimension) * (now - time)
+            iq += imager.image(haze.position + shift, haze.amplitude * (scale * 10 ** (model.clutter / 20)))
+        if noise:
+            iq += math.sqrt(noise) * imager.noise(generator)
+        images.append(iq)
+        if number + 1 < acquisition.packet:
+            moved = advance(cloud.position, flow, now, acquisition.interval)
+            cloud, _ = reseed(Cloud(moved, cloud.amplitude, cloud.tissue), box, flow, now, generator)
+    return Packet(torch.stack(images), grid, acquisition, model.beams, noise)
+
+
+def _box(grid: Grid, model: EchoModel) -> Box:
+    """The grid's box and what lies within reach of the point spread around it."""
+    reach = model.pointspread.reach(model.beams.direction)
+    lower = tuple(a - r for a, r in zip(grid.origin, reach, strict=True))
+    return Box(lower, tuple(b + r for b, r in zip(grid.upper, reach, strict=True)))
+
+
+def _echogenicity(cloud: Cloud, model: EchoModel) -> torch.Tensor:
+    bright = 0.0 if model.tissue is None else 10 ** (model.tissue / 20)
+    return torch.where(cloud.tissue, cloud.amplitude * bright, cloud.amplitude)

@@ -1,0 +1,323 @@
+"""Blood speckle tracking: velocities from the motion of speckle between the images of a packet.
+
+Normalised cross-correlation of small kernels, pooled over the packet, a parabolic sub-sample peak, and the echo's
+phase for the axial component (table 3.1 of the thesis; Trahey, Allison & von Ramm, IEEE TBME 34, 1987, for the
+method; Loupas, Powers & Gill, IEEE UFFC 42, 1995, for what the phase adds). Nothing here knows how images are made.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from enum import IntFlag
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from .acquisition import Packet
+from .clutter import ClutterFilter, FIRFilter
+from .correlation import KernelShape, correlate, gather
+from .peak import Peak, find_peak
+
+
+class Flag(IntFlag):
+    """Why an estimate is not to be believed; several can be set."""
+
+    NONE = 0
+    EDGE = 1  # speed at or beyond the search range
+    WEAK = 2  # too little blood power over noise or clutter
+    SAMPLES = 4  # the image cuts the kernel to fewer samples than required
+    FLAT = 8  # the correlation has no peak (constant image, no scatterers)
+    NOT_FINITE = 16  # NaN or infinity in the kernel
+    DECORRELATED = 32  # correlation below the threshold
+
+
+@dataclass(frozen=True)
+class SpeckleTracker:
+    """Options of speckle tracking; the defaults are table 3.1 of the thesis.
+
+    kernel: side of the kernel, m, on every axis; it covers the nearest odd number of image nodes (7 at 1/6 mm).
+    min_samples: nodes per axis that a kernel needs; coarse images widen it, a cut at the border flags it.
+    search: greatest speed per component, m/s.
+    lags: images between compared ones; the first is searched, each further one refines where it is more certain.
+    phase: refine the axial component by the phase of the correlation.
+    clutter: filter over the packet, ``None`` = already filtered.
+    min_snr: least power over that of thermal noise after the filter, dB, where the packet states its noise;
+        ``None`` = no gate. min_blood: least share of the unfiltered power that passes the filter, dB, or ``None``.
+    min_correlation: least correlation. tile: points correlated at a time, which bounds memory.
+    """
+
+    kernel: float = 1e-3
+    min_samples: int = 3
+    search: float = 1.0
+    lags: tuple[int, ...] = (1, 2, 4)
+    phase: bool = True
+    clutter: ClutterFilter | None = field(default_factory=FIRFilter)
+    min_snr: float | None = 3.0
+    min_blood: float | None = -60.0
+    min_correlation: float = 0.5
+    tile: int = 128
+
+    def __post_init__(self) -> None:
+        for name in ("kernel", "search"):
+            if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0):
+                raise ValueError(f"{name} must be positive and finite, got {getattr(self, name)!r}")
+        if self.min_samples < 3 or self.tile < 1:
+            raise ValueError("min_samples must be >= 3 and tile >= 1")
+        if not self.lags or list(self.lags) != sorted(set(self.lags)) or self.lags[0] < 1:
+            raise ValueError(f"lags must be increasing whole numbers >= 1, got {self.lags!r}")
+        if not 0 <= self.min_correlation < 1:
+            raise ValueError(f"min_correlation must lie in [0, 1), got {self.min_correlation!r}")
+
+    def track(self, packet: Packet, points: Tensor) -> Estimates:
+        """Velocities at the image nodes nearest to ``points`` (n, D), m. See :func:`track`."""
+        return track(packet, points, self)
+
+
+@dataclass(frozen=True, eq=False)
+class Estimates:
+    """What a tracker says of each of n points; components in the order x, y, z.
+
+    velocity (n, D) m/s. correlation (n,) of the accepted lag, in [0, 1]. peak_ratio (n,): highest peak of the
+    search over the second. curvature (n, D): -(second derivative of |rho|) / |rho| per axis, 1/m^2. variance
+    (n, D): (m/s)^2 up to a constant, what correlation and curvature say of the precision; calibration makes a
+    ``sigma`` of it. power (n,): share of the unfiltered power that passed the clutter filter, dB. snr (n,): power
+    over thermal noise after the filter, dB (NaN if the noise is unknown). lag (n,): images between those compared.
+    flags (n,): :class:`Flag` bits, 0 = accepted.
+    """
+
+    velocity: Tensor
+    correlation: Tensor
+    peak_ratio: Tensor
+    curvature: Tensor
+    variance: Tensor
+    power: Tensor
+    snr: Tensor
+    lag: Tensor
+    flags: Tensor
+
+    @property
+    def accepted(self) -> Tensor:
+        """Points (n,) bool without any flag."""
+        return self.flags == 0
+
+
+def track(packet: Packet, points: Tensor, options: SpeckleTracker) -> Estimates:
+    """Track ``points`` (n, D) through a packet. Raises ValueError where fewer than two images are left to compare."""
+    images = _prepare(packet, options)
+    shape = KernelShape(images.half, images.search)
+    nodes = images.nearest_nodes(points)
+    beam = packet.beams.directions(points.to(images.real)).flip(-1)  # array order, as everything inside
+    beam = F.pad(beam, (3 - beam.shape[1], 0)).to(images.volume.device)
+    tiles = [
+        _track_tile(images, nodes[start : start + options.tile], beam[start : start + options.tile], shape, options)
+        for start in range(0, len(points), options.tile)
+    ]
+    if not tiles:
+        tiles = [_track_tile(images, nodes, beam, shape, options)]
+    return Estimates(*(torch.cat(parts) for parts in zip(*tiles, strict=True)))
+
+
+@dataclass(frozen=True, eq=False)
+class _Images:
+    """Filtered images in the layout of :mod:`correlation`, padded so that every block fits.
+
+    volume (Z, Y, X, T); raw_power, power (Z, Y, X): mean squares over the images before and after the filter, and
+    finite (Z, Y, X) whether all are finite, all padded by ``margin``. half, search: nodes per array axis.
+    """
+
+    volume: Tensor
+    raw_power: Tensor
+    power: Tensor
+    finite: Tensor
+    inside: Tensor
+    half: tuple[int, int, int]
+    search: tuple[int, int, int]
+    margin: tuple[int, int, int]
+    spacing: Tensor
+    packet: Packet
+    noise: float | None
+    active: tuple[int, ...]
+
+    @property
+    def real(self) -> torch.dtype:
+        return self.power.dtype
+
+    def nearest_nodes(self, points: Tensor) -> Tensor:
+        """Unpadded node numbers (n, 3), array order, of points (n, D)."""
+        place = self.packet.grid.locate(points.double()).round().long().flip(-1).to(self.volume.device)
+        last = torch.tensor(self.packet.grid.shape, device=place.device) - 1
+        if bool(((place < 0) | (place > last)).any()):
+            raise ValueError("some points to track lie outside the image; select those inside its grid")
+        return F.pad(place, (3 - place.shape[1], 0))
+
+
+def _prepare(packet: Packet, options: SpeckleTracker) -> _Images:
+    if len(packet.iq) < 2:
+        raise ValueError(f"speckle tracking compares images; the packet has {len(packet.iq)}")
+    dimension = packet.grid.dimension
+    finite = torch.isfinite(torch.view_as_real(packet.iq)).all(-1).all(0)
+    clean = torch.where(finite, packet.iq, 0)
+    filtered = clean if options.clutter is None else options.clutter.apply(clean)
+    if len(filtered) < 1 + options.lags[0]:
+        raise ValueError(
+            f"{len(filtered)} images are left of {len(packet.iq)} after the clutter filter, too few for a lag of "
+            f"{options.lags[0]}; use a longer packet or a shorter filter"
+        )
+    spacing = list(reversed(packet.grid.spacing))
+    reach = options.search * packet.acquisition.interval * options.lags[0]
+    half = [max(round(options.kernel / (2 * s)), (options.min_samples - 1) // 2) for s in spacing]
+    search = [math.ceil(reach / s + 0.5 - 1e-9) for s in spacing]
+    # later lags look around a prediction: reach grows with the lag, plus the refinement's own node
+    margin = [h + math.ceil(1.5 * n * options.lags[-1] / options.lags[0]) + 3 for h, n in zip(half, search, strict=True)]
+    lead = 3 - dimension
+    pad = [0] * lead + margin
+    edges = [side for m in reversed(pad) for side in (m, m)]
+
+    def padded(field: Tensor) -> Tensor:
+        return F.pad(field.reshape(*[1] * lead, *field.shape), edges)
+
+    volume = torch.stack([padded(image) for image in filtered], -1)
+    gain = 1.0 if options.clutter is None else options.clutter.noise_gain(len(packet.iq))
+    return _Images(
+        volume, padded(clean.abs().square().mean(0)), padded(filtered.abs().square().mean(0)),
+        padded(finite.to(volume.real.dtype)), padded(torch.ones_like(clean[0].real)),
+        tuple([0] * lead + half), tuple([0] * lead + search), tuple(pad),
+        torch.tensor([1.0] * lead + spacing, dtype=volume.real.dtype, device=volume.device),
+        packet, None if packet.noise is None else packet.noise * gain, tuple(range(lead, 3)),
+    )  # fmt: skip
+
+
+def _track_tile(
+    images: _Images, nodes: Tensor, beam: Tensor, shape: KernelShape, options: SpeckleTracker
+) -> tuple[Tensor, ...]:
+    """The fields of :class:`Estimates` for a tile of nodes (P, 3)."""
+    corner = nodes + nodes.new_tensor(images.margin) - nodes.new_tensor(images.half)
+    snr, power, flags = _gates(images, corner, shape, options)
+    still = torch.zeros_like(nodes)
+    state = _estimate(images, corner, still, options.lags[0], shape, beam, None, options)
+    fine = KernelShape(images.half, tuple(min(s, 1) for s in images.search))
+    for lag in options.lags[1:]:
+        if images.volume.shape[-1] <= lag:
+            break
+        guess = state.motion * lag
+        offset = (guess / images.spacing).round().long()
+        limit = nodes.new_tensor(images.margin) - nodes.new_tensor(images.half) - 2
+        offset = torch.minimum(torch.maximum(offset, -limit), limit)
+        state = state.better(_estimate(images, corner, offset, lag, fine, beam, state, options))
+    active = list(images.active)
+    interval = images.packet.acquisition.interval
+    velocity = state.motion[:, active].flip(-1) / interval
+    flags = flags | _bit(~state.sound, Flag.FLAT)
+    # a fit that overshoots by 2 % of the range is still the range's own edge
+    flags |= _bit((velocity.abs() > options.search * 1.02).any(1) & state.sound, Flag.EDGE)
+    flags |= _bit(state.correlation < options.min_correlation, Flag.DECORRELATED)
+    return (
+        velocity, state.correlation, state.peak_ratio, state.curvature[:, active].flip(-1),
+        state.variance[:, active].flip(-1) / interval**2, power, snr, state.lag, flags,
+    )  # fmt: skip
+
+
+def _bit(condition: Tensor, flag: Flag) -> Tensor:
+    return condition.to(torch.int32) * int(flag)
+
+
+def _gates(
+    images: _Images, corner: Tensor, shape: KernelShape, options: SpeckleTracker
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Power over noise (dB), share of power passed (dB) and the flags that need no correlation, each (P,)."""
+    def kernel(field: Tensor) -> Tensor:
+        return gather(field[..., None].contiguous(), corner, shape.size)[..., 0].transpose(0, 1)
+
+    inside, finite = kernel(images.inside), kernel(images.finite)
+    count = inside.sum((1, 2, 3)).clamp_min(1)
+    passed = kernel(images.power).sum((1, 2, 3)) / count
+    before = kernel(images.raw_power).sum((1, 2, 3)) / count
+    power = 10 * torch.log10(passed / before.clamp_min(torch.finfo(before.dtype).tiny))
+    flags = _bit((finite < inside).any(1).any(1).any(1), Flag.NOT_FINITE)
+    for axis in images.active:
+        others = [a + 1 for a in range(3) if a != axis]
+        flags |= _bit(inside.amax(others).sum(1) < options.min_samples, Flag.SAMPLES)
+    weak = passed <= 0
+    if options.min_blood is not None:
+        weak |= power < options.min_blood
+    snr = torch.full_like(power, math.nan)
+    if images.noise:
+        snr = 10 * torch.log10(passed / images.noise)
+        if options.min_snr is not None:
+            weak |= snr < options.min_snr
+    return snr, power, flags | _bit(weak, Flag.WEAK)
+
+
+@dataclass(frozen=True, eq=False)
+class _State:
+    """The best estimate so far; motion (P, 3) in m per image, array order."""
+
+    motion: Tensor
+    correlation: Tensor
+    peak_ratio: Tensor
+    curvature: Tensor
+    variance: Tensor
+    lag: Tensor
+    sound: Tensor
+
+    def better(self, other: _State) -> _State:
+        """Takes ``other`` where it is sound and promises a smaller total variance."""
+        take = other.sound & (~self.sound | (other.variance.sum(1) < self.variance.sum(1)))
+
+        def pick(name: str) -> Tensor:
+            mine, theirs = getattr(self, name), getattr(other, name)
+            return torch.where(take.view(-1, *[1] * (mine.dim() - 1)), theirs, mine)
+
+        names = ("motion", "correlation", "curvature", "variance", "lag")
+        # the ratio of peaks is that of the wide search: refinements see one peak alone
+        return _State(
+            peak_ratio=self.peak_ratio, sound=self.sound | other.sound, **{name: pick(name) for name in names}
+        )
+
+
+def _estimate(
+    images: _Images, corner: Tensor, offset: Tensor, lag: int, shape: KernelShape, beam: Tensor,
+    prior: _State | None, options: SpeckleTracker,
+) -> _State:  # fmt: skip
+    rho = correlate(images.volume, corner, offset, lag, shape)
+    active = list(images.active)
+    peak = find_peak(rho.squeeze(1) if 0 not in active else rho)
+    spacing, along = images.spacing[active], beam[:, active]
+    start = offset[:, active] * spacing
+    shift = start + peak.lag * spacing
+    magnitude = peak.value.abs()
+    if options.phase:
+        k = images.packet.acquisition.phase_per_metre
+        expected = (shift * along).sum(1) if prior is None else (prior.motion[:, active] * along).sum(1) * lag
+        axial = -(peak.value.angle() + 2 * math.pi * torch.round((-k * expected - peak.value.angle()) / (2 * math.pi))) / k
+        # a lag in nodes is lag * spacing metres, hence the direction
+        lag_nodes = peak.constrained(along * spacing, axial - (start * along).sum(1))
+        shift = start + lag_nodes * spacing
+    variance, curvature = _precision(peak, magnitude, spacing, along, lag, options, images)
+    count = max(images.volume.shape[-1] - lag, 1)
+    whole = offset.new_zeros((len(offset), 3)).to(shift)
+    motion, curves, spread = whole.clone(), whole.clone(), whole.clone()
+    motion[:, active], curves[:, active], spread[:, active] = shift / lag, curvature, variance / (lag**2 * count)
+    sound = peak.concave & (magnitude > 0)
+    return _State(motion, magnitude, peak.ratio, curves, spread, torch.full_like(offset[:, 0], lag), sound)
+
+
+def _precision(
+    peak: Peak, magnitude: Tensor, spacing: Tensor, along: Tensor, lag: int, options: SpeckleTracker, images: _Images
+) -> tuple[Tensor, Tensor]:
+    """Variance of the shift per axis, m^2, up to a constant, and relative curvature, 1/m^2, both (P, D).
+
+    The variance of a correlation peak is that of the noise, 1 - rho^2, over its curvature (as in the Cramer-Rao
+    bound of Walker & Trahey, IEEE UFFC 42, 1995); of the axial component, over the square of the carrier if the
+    phase is used.
+    """
+    metric = torch.outer(spacing, spacing)
+    relative = -peak.hessian / metric / magnitude.clamp_min(1e-6)[:, None, None]
+    noise = (1 - magnitude.square()).clamp_min(1e-6) / magnitude.square().clamp_min(1e-6)
+    variance = noise[:, None] * torch.linalg.inv(relative).diagonal(dim1=1, dim2=2).clamp_min(0)
+    if options.phase:
+        carrier = noise / images.packet.acquisition.phase_per_metre**2
+        variance = variance * (1 - along.square()) + carrier[:, None] * along.square()
+    return variance, relative.diagonal(dim1=1, dim2=2)
