@@ -140,7 +140,7 @@ class _FaceTable:
 
     @staticmethod
     def _triangle(square, along, across, gram, scale):
-        """Minimise |offset - s e0 - t e1|^2 over the triangle: the foot inside it, else a point of an edge."""
+        """Minimise |offset - s e0 - t e1|^2: the foot of the normal if inside, else a point of an edge."""
         a, b, c, over_a, over_c = gram
         s = (c * along - b * across) * scale[1]
         t = (a * across - b * along) * scale[1]

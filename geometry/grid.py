@@ -160,7 +160,7 @@ class Grid:
         return result
 
     def spread(self, values: Tensor, points: Tensor | Stencil, *, outside: str = "clamp") -> Tensor:
-        """The exact adjoint of `sample`: add `values (*lead, n)` to the nodes around points: `(*lead, *shape)`.
+        """The exact adjoint of `sample`: `values (*lead, n)` added to the nodes around: `(*lead, *shape)`.
 
         `<spread(a), b> = <a, sample(b)>` for every a and b. No division by the cell volume takes place.
         """

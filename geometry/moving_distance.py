@@ -1,8 +1,13 @@
 """Signed distance, normal and velocity of a moving wall at any point and time: one look-up per particle.
 
 Grids are made at key frames and are linear in time between them (the thesis's two textures, section 3.1.2).
-Each holds, for every node, the distance (positive inside), its gradient (unit normal INTO the fluid) and the
-velocity of the closest wall point; a blend for the current time is sampled multilinearly.
+Each holds, for every node, the distance d (positive inside), its gradient g (unit normal INTO the fluid) and
+the velocity of the closest wall point; a blend for the current time is sampled with multilinear weights w.
+
+The distance itself is the mean of the interpolated values and of the nodes' tangents, sum w (d + g . (x -
+x_node) / 2): the two errors are opposite, so that it is exact for quadratic functions where plain multilinear
+interpolation, with its error of spacing^2 / 8 times the curvature, would put a wall of radius 9 mm off by 3 %
+of a 1 mm spacing.
 """
 
 from __future__ import annotations
@@ -30,7 +35,11 @@ class WallPoint(NamedTuple):
 
 @dataclass(frozen=True)
 class WallField:
-    """The wall at one time on a grid: `table` `(1 + 2 D, *shape)` of distance, normal and wall velocity."""
+    """The wall at one time on a grid.
+
+    `table` `(1 + 2 D, *shape)` holds d - g . (x_node - c) / 2, g and the wall velocity, c being the grid's
+    centre: with it the mean of values and tangents is sample(table[0]) + (x - c) . sample(g) / 2.
+    """
 
     grid: Grid
     table: Tensor
@@ -40,11 +49,16 @@ class WallField:
         dimension = self.grid.dimension
         values = self.grid.sample(self.table, points)
         normal = torch.nn.functional.normalize(values[1 : 1 + dimension].T, dim=-1, eps=1e-12)
-        return WallPoint(values[0], normal, values[1 + dimension :].T)
+        return WallPoint(self._distance(values, points), normal, values[1 + dimension :].T)
 
     def distance(self, points: Tensor) -> Tensor:
         """Signed distance (m) at points `(n, D)`: `(n,)`, positive inside."""
-        return self.grid.sample(self.table[0], points)
+        return self._distance(self.grid.sample(self.table[: 1 + self.grid.dimension], points), points)
+
+    def _distance(self, values: Tensor, points: Tensor) -> Tensor:
+        lower, upper = points.new_tensor(self.grid.origin), points.new_tensor(self.grid.upper)
+        offset = torch.minimum(torch.maximum(points, lower), upper) - 0.5 * (lower + upper)
+        return values[0] + 0.5 * (offset * values[1 : 1 + self.grid.dimension].T).sum(dim=-1)
 
 
 class MovingDistance:
@@ -77,7 +91,7 @@ class MovingDistance:
         if motion.moves:
             limit = travel * min(grid.spacing)
             ways = [motion.travel(key) for key in range(len(self._pieces))]
-            self._pieces = [max(1, int(np.ceil(way / limit))) for way in ways]
+            self._pieces = [max(1, int(np.ceil(way / limit - 1e-9))) for way in ways]
         self._tables: OrderedDict[tuple[int, int], Tensor] = OrderedDict()
         self._current: tuple[float, WallField] | None = None
 
@@ -128,9 +142,12 @@ class MovingDistance:
         velocity = closest.interpolate(surface, self.motion.velocity(time))
         # On the surface itself the direction to the closest point is lost in round-off; the face's normal is
         # right there.
-        towards = self.grid.nodes().numpy() - closest.point(surface)
+        nodes = self.grid.nodes().numpy()
+        towards = nodes - closest.point(surface)
         flat = distance.reshape(-1, 1)
         close = np.abs(flat) < 1e-3 * min(self.grid.spacing)
         normal = np.where(close, -surface.normals[closest.face], towards / np.where(close, 1.0, flat))
-        rows = np.concatenate([flat, normal, velocity], axis=1).T.reshape(-1, *self.grid.shape)
+        centre = 0.5 * (np.asarray(self.grid.origin) + np.asarray(self.grid.upper))
+        value = flat - 0.5 * ((nodes - centre) * normal).sum(axis=1, keepdims=True)
+        rows = np.concatenate([value, normal, velocity], axis=1).T.reshape(-1, *self.grid.shape)
         return torch.as_tensor(rows, dtype=self.dtype, device=self.device)

@@ -1,4 +1,4 @@
-"""Closed surfaces of simple bodies, triangulated at a chosen spacing: bodies of revolution, boxes, plane outlines.
+"""Closed surfaces of simple bodies at a chosen spacing: bodies of revolution, boxes, plane outlines.
 
 The vertices lie on the body, so that the volume of the mesh converges to the body's with the square of the
 spacing.
@@ -16,7 +16,7 @@ from .surface import Surface, SurfaceError
 def ellipsoid(
     semi_axes: Sequence[float], spacing: float, centre: Sequence[float] = (0.0, 0.0, 0.0)
 ) -> Surface:
-    """An ellipsoid with three semi-axes (m) along x, y, z around `centre`; `spacing` (m) is that of its vertices."""
+    """An ellipsoid, semi-axes (m) along x, y, z, around `centre`; `spacing` (m) between its vertices."""
     axes = _positive("ellipsoid: semi_axes", semi_axes, 3)
     _positive("ellipsoid: spacing", [spacing], 1)
     steps = max(3, round(np.pi * float(axes.max()) / spacing))
@@ -26,7 +26,7 @@ def ellipsoid(
 
 
 def tube(radius: float, length: float, spacing: float) -> Surface:
-    """A straight pipe along z from 0 to `length` (m): wall (region 0), inlet at z = 0 (1), outlet at the end (2)."""
+    """A pipe along z from 0 to `length` (m): wall (region 0), inlet at z = 0 (1), outlet at the end (2)."""
     _positive("tube: radius, length, spacing", [radius, length, spacing], 3)
     across, along = max(1, round(radius / spacing)), max(1, round(length / spacing))
     r = np.concatenate(
@@ -38,7 +38,7 @@ def tube(radius: float, length: float, spacing: float) -> Surface:
 
 
 def box(lower: Sequence[float], upper: Sequence[float], spacing: float) -> Surface:
-    """A box between two corners (m), its sides cut into triangles of about `spacing`; one region, the wall."""
+    """A box between two corners (m), its sides cut at about `spacing`; one region, the wall."""
     lower, upper = np.asarray(lower, np.float64), np.asarray(upper, np.float64)
     size = _positive("box: upper - lower", upper - lower, 3)
     _positive("box: spacing", [spacing], 1)
@@ -70,7 +70,7 @@ def ellipse(semi_axes: Sequence[float], spacing: float, centre: Sequence[float] 
 
 
 def polygon(corners: np.ndarray, spacing: float) -> Surface:
-    """A closed polyline through `corners (n, 2)`, m, counter-clockwise, its sides cut into edges of about `spacing`."""
+    """A closed polyline through `corners (n, 2)`, m, counter-clockwise, cut at about `spacing`."""
     corners = np.asarray(corners, np.float64)
     if corners.ndim != 2 or corners.shape[1] != 2 or len(corners) < 3:
         raise SurfaceError(f"polygon: corners must be (n, 2) with n >= 3, not {corners.shape}")
@@ -85,7 +85,7 @@ def polygon(corners: np.ndarray, spacing: float) -> Surface:
 
 
 def ellipse_rim(semi_axes: Sequence[float], spacing: float) -> np.ndarray:
-    """Points on an ellipse, evenly along its length about `spacing` apart, counter-clockwise: `(n, 2)`, m."""
+    """Points evenly along an ellipse, about `spacing` apart, counter-clockwise: `(n, 2)`, m."""
     fine = np.linspace(0, 2 * np.pi, 2001)
     points = np.stack([semi_axes[0] * np.cos(fine), semi_axes[1] * np.sin(fine)], axis=1)
     length = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
@@ -95,7 +95,7 @@ def ellipse_rim(semi_axes: Sequence[float], spacing: float) -> np.ndarray:
 
 
 def revolved(profile: np.ndarray, spacing: float, region: np.ndarray | int = 0) -> Surface:
-    """The body whose outline `profile (n, 2)` of (radius, z), m, starts and ends on the axis, turned around z.
+    """The body whose outline `profile (n, 2)` of (radius, z), m, is turned around z; it starts and ends there.
 
     Every profile point becomes a ring of vertices about `spacing` apart; `region` labels the n - 1 bands
     between them.
@@ -124,7 +124,7 @@ def ring_of(radius: float, z: float, spacing: float) -> np.ndarray:
 
 
 def stitched(first: int, count: int, second: int, other: int) -> np.ndarray:
-    """Triangles between two rings of `count` and `other` vertices numbered from `first` and `second`; 1 is a pole."""
+    """Triangles between rings of `count` and `other` vertices numbered from `first`, `second`; 1: a pole."""
     faces, i, j = [], 0, 0
     ends = (count if count > 1 else 0, other if other > 1 else 0)
     while i < ends[0] or j < ends[1]:

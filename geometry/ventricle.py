@@ -1,4 +1,4 @@
-"""The thesis's ventricle (section 3.4): a truncated prolate spheroid with an elliptical inlet and a circular outlet.
+"""The thesis's ventricle (section 3.4): a truncated prolate spheroid, elliptical inlet, circular outlet.
 
 The base is the plane z = 0 and stays there, the apex lies on the negative z axis, and the wall moves
 affinely: (x, y) grow with `radial(t)`, z with `axial(t)`. With v = V(t) / V(end diastole), axial = v^k and
@@ -199,7 +199,7 @@ class Ventricle:
             rho=rho,
             mu=mu,
             period=self.beat.period if periodic else 0.0,
-            description="parametric ventricle: truncated prolate spheroid, affine wall motion, fixed base z = 0",
+            description="parametric ventricle: truncated prolate spheroid, affine motion, fixed base z = 0",
             valve_intervals=np.array([(1, *self.beat.filling), (2, *self.beat.ejection)]),
             valve_open=np.stack(
                 [self._open(time, self.beat.filling), self._open(time, self.beat.ejection)], axis=1

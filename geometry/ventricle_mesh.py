@@ -1,4 +1,4 @@
-"""The triangulation of the parametric ventricle: rings down the side, a Delaunay base that keeps both rims."""
+"""The triangulation of the parametric ventricle: rings down the side, a Delaunay base that keeps the rims."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def ventricle_surface(shape: Ventricle, spacing: float) -> Surface:
-    """The end-diastolic surface with vertices about `spacing` (m) apart; SurfaceError where that is too coarse."""
+    """The end-diastolic surface, vertices about `spacing` (m) apart; SurfaceError if that is too coarse."""
     if not 0 < spacing <= 0.5 * shape.base_radius:
         raise SurfaceError(
             f"ventricle: spacing must be positive and below half the base radius, not {spacing} m"
@@ -51,7 +51,7 @@ def _side(shape: Ventricle, spacing: float) -> list[np.ndarray]:
 
 
 def _base(shape: Ventricle, top: np.ndarray, spacing: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The base's own points `(n, 2)`, its faces (numbers below len(top) are the top ring's) and their regions."""
+    """The base's own points `(n, 2)`, its faces (the top ring is numbered first) and their regions."""
     mitral, aortic = (np.asarray(c) for c in (shape.mitral_centre, shape.aortic_centre))
     circle = (shape.aortic_radius, shape.aortic_radius)
     fine = [np.concatenate([rim, top[:, :2]]) for rim in shape.rims(256)]
