@@ -95,7 +95,7 @@ def ellipse_rim(semi_axes: Sequence[float], spacing: float) -> np.ndarray:
 
 
 def revolved(profile: np.ndarray, spacing: float, region: np.ndarray | int = 0) -> Surface:
-    """The body whose outline `profile (n, 2)` of (radius, z), m, is turned around z; it starts and ends there.
+    """The body whose outline `profile (n, 2)` of (radius, z), m, starts and ends on the axis z.
 
     Every profile point becomes a ring of vertices about `spacing` apart; `region` labels the n - 1 bands
     between them.

@@ -30,9 +30,7 @@ def _ellipsoid_distance(axes: np.ndarray, point: np.ndarray) -> float:
     axes = np.asarray(axes, float)
     low = -(axes.min() ** 2) + axes.min() * np.abs(point[axes.argmin()])
     high = -(axes.min() ** 2) + np.linalg.norm(axes * point)
-    root = brentq(
-        lambda t: ((axes * point / (t + axes**2)) ** 2).sum() - 1, low + 1e-14, high + 1e-9, xtol=1e-15
-    )
+    root = brentq(lambda t: ((axes * point / (t + axes**2)) ** 2).sum() - 1, low - 1e-12, high + 1e-12)
     closest = axes**2 * point / (root + axes**2)
     inside = ((point / axes) ** 2).sum() < 1
     return float(np.linalg.norm(point - closest)) * (1 if inside else -1)
@@ -160,7 +158,7 @@ def test_a_box_that_moves_several_spacings_between_frames_stays_exact(frames: in
 
 
 def test_the_interpolated_distance_normal_and_velocity_of_a_growing_sphere() -> None:
-    sphere, times = ellipsoid((1.0, 1.0, 1.0), 0.05), np.linspace(0, 1, 6)
+    sphere, times = ellipsoid((1.0, 1.0, 1.0), 0.04), np.linspace(0, 1, 2)
     motion = WallMotion.through(
         times, sphere.vertices * (1 + 0.3 * times[:, None, None]), sphere.faces, sphere.region
     )
@@ -170,7 +168,7 @@ def test_the_interpolated_distance_normal_and_velocity_of_a_growing_sphere() -> 
     draw = np.random.default_rng(2)
     direction = draw.normal(size=(200, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    for t in (0.1, 0.55):
+    for t in (0.1, 0.25):
         radius = 1 + 0.3 * t
         points = direction * (radius + draw.uniform(-0.25, 0.25, (200, 1)))
         wall = moving.at(t).at(torch.as_tensor(points, dtype=torch.float32))
