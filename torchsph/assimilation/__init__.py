@@ -4,6 +4,8 @@ An ensemble is `(*batch, N, n)`; `predicted (*batch, N, m)` is the observation o
 filter here is a `Filter`: `analyse(ensemble, predicted, observations, ...) -> Analysis`.
 """
 
+from .augmented import Augmentation, Parameter
+from .correlated import gaussian_correlation, redundancy, thin
 from .diagnostics import (
     InnovationStatistics,
     chi2_band,
@@ -19,6 +21,7 @@ from .errors import AssimilationError
 from .etkf import ETKF
 from .failures import Replacement, replace_failed
 from .filters import Analysis, EnsembleFilter, Filter, GlobalTransform, Transform, check_ensemble
+from .hybrid import HybridGain
 from .inflation import RTPP, RTPS, Adaptive, Inflation, Multiplicative
 from .letkf import LETKF, LocalTransform
 from .localisation import Localisation, gaspari_cohn
@@ -39,18 +42,21 @@ __all__ = [
     "Adaptive",
     "Analysis",
     "AssimilationError",
+    "Augmentation",
     "EnsembleFilter",
     "ErrorSubspace",
     "Filter",
     "FilterRecord",
     "FixedLagSmoother",
     "GlobalTransform",
+    "HybridGain",
     "Inflation",
     "InnovationStatistics",
     "LocalTransform",
     "Localisation",
     "Multiplicative",
     "Observations",
+    "Parameter",
     "Reason",
     "ReducedUnscented",
     "Replacement",
@@ -71,12 +77,15 @@ __all__ = [
     "draw_points",
     "effective_size",
     "gaspari_cohn",
+    "gaussian_correlation",
     "nees",
     "random_rotation",
     "rank_histogram",
+    "redundancy",
     "replace_failed",
     "screen",
     "spread_skill",
+    "thin",
     "update_weights",
     "zero_sum_basis",
 ]
