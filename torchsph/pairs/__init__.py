@@ -1,10 +1,10 @@
 """Pair sums over neighbouring particles behind one interface, with interchangeable backends."""
 
-from .interface import Backend, MomentumTerms, PairState, Rates, RateTerms, Support
+from .interface import Backend, Moments, MomentumTerms, PairState, Rates, RateTerms, Support
 from .reference import ReferenceBackend
 from .registry import available_backends, backend
 
 __all__ = [
-    "Backend", "MomentumTerms", "PairState", "RateTerms", "Rates", "ReferenceBackend", "Support",
+    "Backend", "Moments", "MomentumTerms", "PairState", "RateTerms", "Rates", "ReferenceBackend", "Support",
     "available_backends", "backend",
 ]

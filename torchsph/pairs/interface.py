@@ -127,6 +127,29 @@ class MomentumTerms:
     def __post_init__(self) -> None:
         if self.pressure is not None and self.pressure not in PRESSURE_FORMS:
             raise ValueError(f"pressure must be one of {PRESSURE_FORMS} or None, got '{self.pressure}'")
+        if self.tensile is not None and self.pressure != "symmetric":
+            raise ValueError(f"the tensile term belongs to the symmetric pressure form, got pressure '{self.pressure}'")
+
+
+@dataclass(frozen=True)
+class Moments:
+    """Sums over the particles b around query points, with the offset s = x_b - x_query and the weight W(|s|, h).
+
+    Attributes:
+        count: (M,) number of particles with a positive weight, in the dtype of the others.
+        value: (M,) sum of W.
+        first: (M, D) of W s.
+        second: (M, D, D) of W s (x) s.
+        field: (M, C) of W A.
+        field_first: (M, D, C) of W s (x) A.
+    """
+
+    count: Tensor
+    value: Tensor
+    first: Tensor
+    second: Tensor
+    field: Tensor
+    field_first: Tensor
 
 
 class Backend(ABC):
@@ -153,6 +176,12 @@ class Backend(ABC):
     def momentum(self, pairs: Any, state: PairState, support: Support, terms: MomentumTerms) -> Tensor:
         """Second pass: acceleration (N, D)."""
 
+    def right_hand_side(
+        self, pairs: Any, state: PairState, support: Support, rates: RateTerms, momentum: MomentumTerms
+    ) -> tuple[Rates, Tensor]:
+        """Both passes at one state, where the pressure does not wait for the rates; a backend may share their loop."""
+        return self.rates(pairs, state, support, rates), self.momentum(pairs, state, support, momentum)
+
     @abstractmethod
     def laplacian(
         self, pairs: Any, state: PairState, support: Support, field: Tensor, active: Tensor | None = None
@@ -162,17 +191,32 @@ class Backend(ABC):
         ``active`` (N,) bool: only pairs of two active particles count (None: all).
         """
 
+    @abstractmethod
+    def interpolate(
+        self, position: Tensor, member: Tensor, fields: Tensor, support: Support, query: Tensor,
+        query_member: Tensor, *, period: Tensor | None = None,
+    ) -> Moments:
+        """Moments of a first-order moving-least-squares fit at query points.
+
+        Args:
+            position: (N, D), member: (N,) int64, fields: (N, C) of the particles.
+            query: (M, D), query_member: (M,) int64; a query sees the particles of its own member only.
+        """
+
 
 def per_particle(value: float | Tensor, member: Tensor) -> float | Tensor:
     """A coefficient given per member, (members,), spread over the particles (N,); a float stays a float."""
     return value.index_select(0, member) if isinstance(value, Tensor) and value.ndim else value
 
 
-def check_search(position: Tensor, radius: float, period: Tensor | None) -> None:
-    """Raise ValueError where no backend could search: non-finite positions, or a period under three radii."""
+def check_search(position: Tensor | None, radius: float, period: Tensor | None) -> None:
+    """Raise ValueError where no backend could search: non-finite positions, or a period under three radii.
+
+    A backend that checks the positions itself while it sorts them passes None.
+    """
     if radius <= 0:
         raise ValueError(f"the search radius must be positive, got {radius}")
-    if not torch.isfinite(position).all():
+    if position is not None and not torch.isfinite(position).all():
         bad = int((~torch.isfinite(position).all(dim=1)).sum())
         raise ValueError(f"{bad} particle positions are not finite; freeze or remove them before the search")
     if period is not None and bool((period < 3 * radius).any()):

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from .interface import (
     Backend,
+    Moments,
     MomentumTerms,
     PairState,
     Rates,
@@ -17,7 +18,7 @@ from .interface import (
     check_search,
     per_particle,
 )
-from .search import half_pairs
+from .search import cross_pairs, half_pairs, nearest_image
 
 # keeps 1 / r^2 finite for coinciding particles, in squared smoothing lengths (epsilon of 2.28)
 SINGULARITY = 0.01
@@ -35,11 +36,7 @@ class PairList:
     def separation(self, position: Tensor) -> Tensor:
         """x_a - x_b of the nearest images, (P, D)."""
         gap = position.index_select(0, self.first) - position.index_select(0, self.second)
-        if self.period is None:
-            return gap
-        finite = torch.isfinite(self.period)
-        length = torch.where(finite, self.period, torch.ones_like(self.period))
-        return gap - torch.where(finite, length * torch.round(gap / length), torch.zeros_like(gap))
+        return nearest_image(gap, self.period)
 
 
 class ReferenceBackend(Backend):
@@ -118,6 +115,27 @@ class ReferenceBackend(Backend):
             weight = weight * (a & b).to(weight.dtype)
         drop = -geometry.second_minus_first(field) * weight
         return geometry.collect(vb * drop, -va * drop), geometry.collect(vb * weight, va * weight)
+
+    def interpolate(
+        self, position: Tensor, member: Tensor, fields: Tensor, support: Support, query: Tensor,
+        query_member: Tensor, *, period: Tensor | None = None,
+    ) -> Moments:
+        check_search(torch.cat((position, query)), support.radius, period)
+        row, particle = cross_pairs(query, query_member, position, member, support.radius, period)
+        offset = nearest_image(position.index_select(0, particle) - query.index_select(0, row), period)
+        length = per_particle(support.length, query_member.index_select(0, row))
+        weight = support.kernel.value(offset.norm(dim=1), length, support.dimension)
+        first = weight[:, None] * offset
+        carried = fields.index_select(0, particle)
+
+        def collect(part: Tensor) -> Tensor:
+            return part.new_zeros((query.shape[0], *part.shape[1:])).index_add(0, row, part)
+
+        return Moments(
+            collect((weight > 0).to(weight.dtype)), collect(weight), collect(first),
+            collect(first[:, :, None] * offset[:, None, :]), collect(weight[:, None] * carried),
+            collect(first[:, :, None] * carried[:, None, :]),
+        )
 
 
 def _central_forces(

@@ -4,7 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import torch
+
+from .cpu import CpuBackend
 from .interface import Backend
+from .native import LibraryMissing, library
 from .reference import ReferenceBackend
 
 
@@ -19,7 +23,18 @@ class BackendStatus:
 
 def available_backends(device: str = "cpu") -> list[BackendStatus]:
     """The backends known to the project, best first, with the reason why each can or cannot be used on ``device``."""
-    return [BackendStatus("reference", True, "plain torch, any device, always present")]
+    reference = BackendStatus("reference", True, "plain torch, any device, always present")
+    return [_cpu_status(device), reference]
+
+
+def _cpu_status(device: str) -> BackendStatus:
+    if torch.device(device).type != "cpu":
+        return BackendStatus("cpu", False, f"works on CPU tensors only, the device asked for is '{device}'")
+    try:
+        compiled = library()
+    except LibraryMissing as problem:
+        return BackendStatus("cpu", False, str(problem))
+    return BackendStatus("cpu", True, f"compiled C++ on {compiled.instruction_set} instructions")
 
 
 def backend(name: str = "auto", device: str = "cpu") -> Backend:
@@ -41,4 +56,4 @@ def backend(name: str = "auto", device: str = "cpu") -> Backend:
 
 
 def _make(name: str) -> Backend:
-    return {"reference": ReferenceBackend}[name]()
+    return {"cpu": CpuBackend, "reference": ReferenceBackend}[name]()

@@ -104,37 +104,43 @@ def _expand(start: Tensor, stop: Tensor) -> tuple[Tensor, Tensor]:
     return row, start[row] + within
 
 
+def nearest_image(gap: Tensor, period: Tensor | None) -> Tensor:
+    """Separations (P, D) between the nearest images of two particles; ``period`` (D,), inf where not periodic."""
+    if period is None:
+        return gap
+    finite = torch.isfinite(period)
+    length = torch.where(finite, period, torch.ones_like(period)).to(gap.dtype)
+    return torch.where(finite, gap - length * torch.round(gap / length), gap)
+
+
 def _square_distance(position: Tensor, first: Tensor, second: Tensor, period: Tensor | None) -> Tensor:
-    gap = position.index_select(0, first) - position.index_select(0, second)
-    if period is not None:
-        finite = torch.isfinite(period)
-        length = torch.where(finite, period, torch.ones_like(period)).to(position.dtype)
-        gap = torch.where(finite, gap - length * torch.round(gap / length), gap)
+    gap = nearest_image(position.index_select(0, first) - position.index_select(0, second), period)
     return (gap * gap).sum(1)
 
 
 def cross_pairs(
-    query: Tensor, query_member: Tensor, position: Tensor, member: Tensor, radius: float
+    query: Tensor, query_member: Tensor, position: Tensor, member: Tensor, radius: float,
+    period: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """All (query, particle) index pairs of one member closer than ``radius``, sorted by query; (P,) int64 each."""
     empty = torch.zeros(0, dtype=torch.int64, device=position.device)
     if query.shape[0] == 0 or position.shape[0] == 0:
         return empty, empty
     both, members = torch.cat([position, query]).detach(), torch.cat([member, query_member])
-    cell, cells = _cells(both, radius, None)
+    cell, cells = _cells(both, radius, period)
     count = position.shape[0]
     key = _key(cell[:count], members[:count], cells)
     order = torch.argsort(key)
     sorted_key = key[order]
     rows, found = [], []
     for offset in itertools.product((-1, 0, 1), repeat=position.shape[1]):
-        target, real = _shifted(cell[count:], offset, cells, None)
+        target, real = _shifted(cell[count:], offset, cells, period)
         wanted = _key(target, members[count:], cells)
         start = torch.searchsorted(sorted_key, wanted)
         stop = torch.where(real, torch.searchsorted(sorted_key, wanted, right=True), start)
         row, at = _expand(start, stop)
         at = order[at]
-        gap = query.index_select(0, row) - position.index_select(0, at)
+        gap = nearest_image(query.index_select(0, row) - position.index_select(0, at), period)
         close = (gap * gap).sum(1) < radius * radius
         rows.append(row[close])
         found.append(at[close])

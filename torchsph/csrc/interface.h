@@ -1,0 +1,76 @@
+/* What Python calls through ctypes.  Plain C; every array belongs to the caller; lengths in the caller's unit. */
+#ifndef TORCHSPH_INTERFACE_H
+#define TORCHSPH_INTERFACE_H
+#include <stdint.h>
+
+enum { SPH_DONE = 0, SPH_NOT_COMPILED = 1 };
+
+typedef struct { /* particles to be searched */
+  int64_t particles;
+  const void* position;  /* (particles, dimension) */
+  const int64_t* member; /* (particles,) */
+  double radius;
+  double period[3];      /* infinity: not periodic */
+  int32_t dimension, threads;
+} sph_search;
+
+typedef struct {
+  int64_t clusters, members, unusable; /* unusable: particles not finite or of a negative member; nothing was sorted */
+} sph_sizes;
+
+typedef struct { /* cluster lists; see lists.hpp */
+  int32_t* slot;    /* (8 clusters,) particle of each slot, ~particle for padding */
+  int32_t* owner;   /* (clusters,) member */
+  int64_t* offset;  /* (clusters,) */
+  int32_t* entries; /* (capacity,) */
+  void* home;       /* (8 clusters, dimension) sorted positions, or null */
+} sph_lists;
+
+typedef struct {
+  int32_t dimension, threads;
+  uint32_t terms;             /* sum of sph::Term */
+  int32_t weight, form, kernel;
+  double support, sigma;
+  int64_t particles, clusters;
+  const int32_t *slot, *owner, *entries;
+  const int64_t* offset;
+  const void* home;           /* null: no periodic axis */
+  double period[3];
+  const double* coefficients; /* (members, 4): smoothing length, artificial, laminar, tensile */
+  const void *position, *velocity, *mass, *deviation, *pressure, *field;
+  const uint8_t* active;
+  void *divergence, *diffusion, *concentration, *xsph, *acceleration, *shepard_volume, *shepard_mass, *renormalisation,
+      *laplacian, *diagonal;
+} sph_pass;
+
+typedef struct { /* moments of a first-order moving-least-squares fetch; see interpolation.hpp */
+  sph_search particles;
+  const void* fields;         /* (particles, columns) */
+  int64_t columns, queries;
+  const void* query;          /* (queries, dimension) */
+  const int64_t* query_member;
+  int32_t kernel;
+  double support, sigma;
+  const double* lengths;      /* (members,) */
+  void *count, *value, *first, *second, *field, *field_first;
+} sph_interpolation;
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+#pragma GCC visibility push(default)
+int sph_sort_f32(const sph_search*, sph_sizes*);
+int sph_sort_f64(const sph_search*, sph_sizes*);
+int64_t sph_list_f32(const sph_search*, int64_t capacity, sph_lists*); /* entries needed; call again if above capacity */
+int64_t sph_list_f64(const sph_search*, int64_t capacity, sph_lists*);
+int sph_pass_f32(const sph_pass*);
+int sph_pass_f64(const sph_pass*);
+int64_t sph_interpolate_f32(const sph_interpolation*); /* number of unusable particles and queries; 0: done */
+int64_t sph_interpolate_f64(const sph_interpolation*);
+int sph_runs(const char* instruction_set);             /* whether this processor has it */
+double sph_fma_peak(int threads, int64_t turns);       /* float32 multiply-adds, in flop/s */
+#pragma GCC visibility pop
+#ifdef __cplusplus
+}
+#endif
+#endif

@@ -1,0 +1,124 @@
+// Plain C interface to the search and the pair sums; compiled once for each precision (SPH_REAL) and instruction set.
+#include "interface.h"
+
+#include <utility>
+
+#include "interpolation.hpp"
+#include "lists.hpp"
+#include "passes.hpp"
+
+#ifndef SPH_REAL
+#error "compile with -DSPH_REAL=float -DSPH_SUFFIX=_f32 or -DSPH_REAL=double -DSPH_SUFFIX=_f64"
+#endif
+#define SPH_JOIN(a, b) a##b
+#define SPH_PASTE(a, b) SPH_JOIN(a, b)
+#define SPH_NAME(name) SPH_PASTE(name, SPH_SUFFIX)
+
+namespace {
+
+using namespace sph;
+using Real = SPH_REAL;
+
+// Kept between calls of a thread, so that a step allocates nothing.
+thread_local Columns<Real> columns, queries;
+thread_local Rows<Real> rows;
+
+Shape shape_of(const sph_search& s) {
+  return {s.particles, s.member, s.radius, {s.period[0], s.period[1], s.period[2]}, s.threads};
+}
+
+// The combinations that are compiled: every subset of the rates, every subset of the accelerations, and (float on wide
+// registers) the two together, where a scheme evaluates them at one state. Elsewhere the caller makes two passes.
+constexpr bool compiled(std::uint32_t t) {
+  const std::uint32_t rates = t & (continuity | diffusion | concentration | xsph);
+  const std::uint32_t forces = t & (pressure | artificial | laminar | tensile);
+  if (t > 255) return t == shepard || t == renormalisation || t == laplacian;
+  if ((t & tensile) && !(t & pressure)) return false;
+  if (!rates || !forces) return t != 0;
+  return sizeof(Real) == 4 && register_bytes > 16 && (t & continuity) && (t & pressure) && !(t & tensile);
+}
+
+using Run = void (*)(const Lists<Real>&, const Rows<Real>&, const KernelChoice&, const Coefficients*, const Outputs<Real>&);
+
+template <int D, std::uint32_t T> constexpr Run run_of() {
+  if constexpr (compiled(T)) return &Pass<Real, D, T>::run;
+  else return nullptr;
+}
+
+template <int D, std::size_t... T> Run find(std::uint32_t terms, std::index_sequence<T...>) {
+  static constexpr Run table[] = {run_of<D, T>()...};
+  if (terms < sizeof...(T)) return table[terms];
+  return terms == shepard           ? run_of<D, shepard>()
+         : terms == renormalisation ? run_of<D, renormalisation>()
+         : terms == laplacian       ? run_of<D, laplacian>()
+                                    : nullptr;
+}
+
+template <int D> int pass(const sph_pass& p) {
+  const Run run = find<D>(p.terms, std::make_index_sequence<256>());
+  if (!run) return SPH_NOT_COMPILED;
+  const auto reals = [](const void* a) { return static_cast<const Real*>(a); };
+  const auto out = [](void* a) { return static_cast<Real*>(a); };
+  const Lists<Real> lists{p.particles, p.clusters, p.slot, p.owner, p.entries, p.offset, reals(p.home),
+                          {p.period[0], p.period[1], p.period[2]}, p.home != nullptr, p.threads};
+  const State<Real> state{reals(p.position), reals(p.velocity), reals(p.mass), reals(p.deviation), reals(p.pressure),
+                          reals(p.field), p.active, p.weight, p.form};
+  const Outputs<Real> outputs{out(p.divergence), out(p.diffusion), out(p.concentration), out(p.xsph), out(p.acceleration),
+                              out(p.shepard_volume), out(p.shepard_mass), out(p.renormalisation), out(p.laplacian),
+                              out(p.diagonal)};
+  const KernelChoice kernel{p.kernel, p.support, p.sigma};
+  pack<Real, D>(layout(D, p.terms), state, lists, rows);
+  run(lists, rows, kernel, reinterpret_cast<const Coefficients*>(p.coefficients), outputs);
+  return SPH_DONE;
+}
+
+template <int D> std::int64_t lists(const sph_search& s, std::int64_t capacity, sph_lists& out) {
+  const std::int64_t needed = list_all<Real, D>(columns, shape_of(s), capacity, out.offset, out.entries);
+  std::copy(columns.slot.begin(), columns.slot.end(), out.slot);
+  std::copy(columns.owner.begin(), columns.owner.end(), out.owner);
+  if (Real* home = static_cast<Real*>(out.home))
+    for (std::int64_t i = 0; i < columns.slots(); ++i)
+      for (int d = 0; d < D; ++d) home[i * D + d] = columns.at[d][i];
+  return needed;
+}
+
+template <int D> std::int64_t interpolate(const sph_interpolation& p) {
+  const Shape shape = shape_of(p.particles);
+  const Shape asked{p.queries, p.query_member, shape.radius, {shape.period[0], shape.period[1], shape.period[2]}, shape.threads};
+  if (const std::int64_t bad = sort_columns<Real, D>(shape, static_cast<const Real*>(p.particles.position), columns)) return bad;
+  if (const std::int64_t bad = sort_queries<Real, D>(asked, static_cast<const Real*>(p.query), columns, queries)) return bad;
+  const InterpolationKernel kernel{{p.kernel, p.support, p.sigma}, p.lengths};
+  const auto out = [](void* a) { return static_cast<Real*>(a); };
+  const Moments<Real> moments{out(p.count), out(p.value), out(p.first), out(p.second), out(p.field), out(p.field_first)};
+  const Real* fields = static_cast<const Real*>(p.fields);
+  Interpolation<Real, D, true>::sweep(columns, queries, shape, kernel, fields, 0, p.columns, moments);
+  for (std::int64_t c = 0; c < p.columns; c += D)
+    Interpolation<Real, D, false>::sweep(columns, queries, shape, kernel, fields, c, p.columns, moments);
+  return 0;
+}
+
+}  // namespace
+
+extern "C" {
+
+int SPH_NAME(sph_sort)(const sph_search* s, sph_sizes* sizes) {
+  const Real* position = static_cast<const Real*>(s->position);
+  const Shape shape = shape_of(*s);
+  sizes->unusable = s->dimension == 3 ? sort_columns<Real, 3>(shape, position, columns)
+                                      : sort_columns<Real, 2>(shape, position, columns);
+  sizes->clusters = columns.clusters;
+  sizes->members = columns.members;
+  return SPH_DONE;
+}
+
+int64_t SPH_NAME(sph_list)(const sph_search* s, int64_t capacity, sph_lists* out) {
+  return s->dimension == 3 ? lists<3>(*s, capacity, *out) : lists<2>(*s, capacity, *out);
+}
+
+int64_t SPH_NAME(sph_interpolate)(const sph_interpolation* p) {
+  return p->particles.dimension == 3 ? interpolate<3>(*p) : interpolate<2>(*p);
+}
+
+int SPH_NAME(sph_pass)(const sph_pass* p) { return p->dimension == 3 ? pass<3>(*p) : pass<2>(*p); }
+
+}

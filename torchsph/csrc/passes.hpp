@@ -1,0 +1,174 @@
+// The pair sums: one template, whose terms are chosen when it is compiled; what is not asked for is not in the loop.
+#pragma once
+#include "rows.hpp"
+#include "smoothing.hpp"
+
+namespace sph {
+
+constexpr double singularity = 0.01;  // keeps 1 / r^2 finite, in squared smoothing lengths (epsilon of thesis 2.28)
+
+template <class Real> struct Outputs {  // arrays in the caller's order; null where a sum was not asked for
+  Real *divergence, *diffusion, *concentration, *xsph, *acceleration, *shepard_volume, *shepard_mass, *renormalisation,
+      *laplacian, *diagonal;
+};
+
+struct Coefficients {  // of one member
+  double length, artificial, laminar, tensile;  // tensile: R / w(r0 / h)^4
+};
+
+struct KernelChoice {
+  std::int32_t kind;
+  double support, sigma;
+};
+
+template <class Real, int D, std::uint32_t T> struct Pass {
+  using L = Lanes<Real>;
+  using V = typename L::Vector;
+  static constexpr Layout at = layout(D, T);
+  static constexpr bool has(std::uint32_t t) { return (T & t) != 0; }
+  static constexpr bool jumps = has(continuity | xsph | artificial | laminar);
+
+  struct Constants {  // of one member, spread over a register
+    V inverse_length, epsilon, artificial, laminar, tensile;
+    Real support;
+    std::int32_t kernel;
+  };
+
+  struct Sums {
+    V divergence{}, diffusion{}, shepard_volume{}, shepard_mass{}, laplacian{}, diagonal{};
+    V concentration[D] = {}, xsph[D] = {}, acceleration[D] = {}, renormalisation[D * D] = {};
+  };
+
+  struct Own {  // the particles a
+    V field[at.fields];
+  };
+
+  static SPH_INLINE void add(const Constants& k, const Own& a, const Partner<Real, at.fields>& b, Sums& s) {
+    V gap[D], square{}, jump[D], approach{};
+    for (int d = 0; d < D; ++d) {
+      gap[d] = a.field[d] - b.field(d);
+      square += gap[d] * gap[d];
+    }
+    const V q_square = square * k.inverse_length * k.inverse_length;
+    const Smoothing<V> w = smoothing<Real, V>(k.kernel, q_square, k.support);
+    if constexpr (jumps)
+      for (int d = 0; d < D; ++d) jump[d] = a.field[at.velocity + d] - b.field(at.velocity + d);
+    if constexpr (has(continuity | artificial))
+      for (int d = 0; d < D; ++d) approach += jump[d] * gap[d];
+    const V weight = b.field(at.weight), slope = weight * w.slope;
+
+    if constexpr (has(continuity)) s.divergence -= slope * approach;
+    if constexpr (has(diffusion)) s.diffusion += slope * (a.field[at.deviation] - b.field(at.deviation));
+    if constexpr (has(concentration))
+      for (int d = 0; d < D; ++d) s.concentration[d] += slope * gap[d];
+    if constexpr (has(renormalisation))
+      for (int d = 0; d < D; ++d) {
+        const V part = slope * gap[d];
+        for (int e = 0; e < D; ++e) s.renormalisation[d * D + e] -= part * gap[e];
+      }
+    if constexpr (has(shepard)) {
+      s.shepard_volume += weight * w.value;
+      s.shepard_mass += b.field(at.mass) * w.value;
+    }
+
+    // one division serves 1 / (k_a + k_b), 1 / (r^2 + eps h^2) and their product
+    V per_inertia{}, per_square{}, per_both{};
+    if constexpr (has(artificial)) {
+      const V inertia = a.field[at.inertia] + b.field(at.inertia), distance = square + k.epsilon;
+      per_both = 1 / (inertia * distance);
+      if constexpr (has(xsph)) per_inertia = per_both * distance;
+      if constexpr (has(laminar)) per_square = per_both * inertia;
+    } else {
+      if constexpr (has(xsph)) per_inertia = 1 / (a.field[at.inertia] + b.field(at.inertia));
+      if constexpr (has(laminar | laplacian)) per_square = 1 / (square + k.epsilon);
+    }
+    if constexpr (has(xsph)) {
+      const V pull = weight * w.value * per_inertia;
+      for (int d = 0; d < D; ++d) s.xsph[d] -= pull * jump[d];
+    }
+    if constexpr (has(pressure | artificial)) {
+      V push{};
+      if constexpr (has(pressure)) push = a.field[at.stress] + b.field(at.stress);
+      if constexpr (has(tensile)) {
+        const V w2 = w.value * w.value;
+        push += k.tensile * w2 * w2 * (magnitude(a.field[at.stress]) + magnitude(b.field(at.stress)));
+      }
+      if constexpr (has(artificial)) push -= k.artificial * negative_part(approach) * per_both;
+      const V force = slope * push;
+      for (int d = 0; d < D; ++d) s.acceleration[d] -= force * gap[d];
+    }
+    if constexpr (has(laminar)) {
+      const V rate = k.laminar * slope * square * per_square * (a.field[at.inverse] + b.field(at.inverse));
+      for (int d = 0; d < D; ++d) s.acceleration[d] += rate * jump[d];
+    }
+    if constexpr (has(laplacian)) {
+      const V part = slope * square * per_square;
+      s.diagonal -= part;
+      s.laplacian -= part * (a.field[at.field] - b.field(at.field));
+    }
+  }
+
+  static SPH_INLINE void put(V sum, Real scale, const Real* factor, const std::int32_t* slot, Real* out, int stride, int component) {
+    Real lane[cluster_size];
+    L::store_own(lane, sum);
+    for (int l = 0; l < L::own; ++l)
+      if (slot[l] >= 0) out[std::int64_t(slot[l]) * stride + component] = (factor ? factor[l] : Real(1)) * scale * lane[l];
+  }
+
+  static SPH_INLINE void write(const Sums& s, const std::int32_t* slot, const Real* factor, Real per_value, Real per_slope,
+                               const Outputs<Real>& o) {
+    if constexpr (has(continuity)) put(s.divergence, per_slope, nullptr, slot, o.divergence, 1, 0);
+    if constexpr (has(diffusion)) put(s.diffusion, 2 * per_slope, nullptr, slot, o.diffusion, 1, 0);
+    if constexpr (has(shepard)) {
+      put(s.shepard_volume, per_value, nullptr, slot, o.shepard_volume, 1, 0);
+      put(s.shepard_mass, per_value, nullptr, slot, o.shepard_mass, 1, 0);
+    }
+    if constexpr (has(laplacian)) {
+      put(s.laplacian, 2 * per_slope, factor, slot, o.laplacian, 1, 0);
+      put(s.diagonal, 2 * per_slope, factor, slot, o.diagonal, 1, 0);
+    }
+    for (int d = 0; d < D; ++d) {
+      if constexpr (has(concentration)) put(s.concentration[d], per_slope, nullptr, slot, o.concentration, D, d);
+      if constexpr (has(xsph)) put(s.xsph[d], 2 * per_value, factor, slot, o.xsph, D, d);
+      if constexpr (has(pressure | artificial | laminar)) put(s.acceleration[d], per_slope, factor, slot, o.acceleration, D, d);
+    }
+    if constexpr (has(renormalisation))
+      for (int d = 0; d < D * D; ++d) put(s.renormalisation[d], per_slope, nullptr, slot, o.renormalisation, D * D, d);
+  }
+
+  static void run(const Lists<Real>& lists, const Rows<Real>& rows, const KernelChoice& choice, const Coefficients* members,
+                  const Outputs<Real>& outputs) {
+#pragma omp parallel for num_threads(lists.threads) schedule(dynamic, 16)
+    for (std::int64_t g = 0; g < lists.clusters; ++g) {
+      const Coefficients& c = members[lists.owner[g]];
+      const double h = c.length;
+      const Constants k{L::all(Real(1 / h)), L::all(Real(singularity * h * h)), L::all(Real(2 * c.artificial * h)),
+                        L::all(Real(c.laminar)), L::all(Real(c.tensile)), Real(choice.support), choice.kind};
+      const Real per_value = Real(choice.sigma / std::pow(h, D)), per_slope = Real(choice.sigma / std::pow(h, D + 2));
+      const Real* block = rows.block.data() + g * at.block();
+      for (int group = 0; group < L::groups; ++group) {
+        Own a;
+        for (int f = 0; f < at.fields; ++f) a.field[f] = L::load_own(block + f * cluster_size + group * L::own);
+        V home[D];
+        for (int d = 0; d < D; ++d) home[d] = a.field[d];
+        Sums sums;
+        for (const std::int32_t* list = lists.entries + lists.offset[g]; list[0] >= 0;) {
+          const std::int32_t image = list[0], count = list[1];
+          if (lists.periodic)
+            for (int d = 0; d < D; ++d) {
+              const int step = image_step(image, d);
+              a.field[d] = home[d] + (step ? Real(step * lists.period[d]) : Real(0));
+            }
+          list += 2;
+          for (std::int32_t n = 0; n < count; n += L::partners)
+            add(k, a, Partner<Real, at.fields>(rows.row.data(), list + n, at.stride()), sums);
+          list += count;
+        }
+        write(sums, lists.slot + g * cluster_size + group * L::own, block + at.factor() * cluster_size + group * L::own,
+              per_value, per_slope, outputs);
+      }
+    }
+  }
+};
+
+}  // namespace sph

@@ -1,0 +1,133 @@
+"""The compiled pair kernels: which library fits this processor, and its plain C interface seen through ctypes."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+from . import build
+
+PREFERENCE = ("avx512", "avx2", "baseline")
+FORCED = "TORCHSPH_ISA"
+
+_pointer, _int, _long, _real = ctypes.c_void_p, ctypes.c_int32, ctypes.c_int64, ctypes.c_double
+
+
+class SearchArguments(ctypes.Structure):
+    """sph_search of csrc/interface.h."""
+
+    _fields_ = [
+        ("particles", _long), ("position", _pointer), ("member", _pointer), ("radius", _real),
+        ("period", _real * 3), ("dimension", _int), ("threads", _int),
+    ]
+
+
+class Sizes(ctypes.Structure):
+    """sph_sizes of csrc/interface.h."""
+
+    _fields_ = [("clusters", _long), ("members", _long), ("unusable", _long)]
+
+
+class ListArguments(ctypes.Structure):
+    """sph_lists of csrc/interface.h."""
+
+    _fields_ = [(name, _pointer) for name in ("slot", "owner", "offset", "entries", "home")]
+
+
+class PassArguments(ctypes.Structure):
+    """sph_pass of csrc/interface.h."""
+
+    _fields_ = [
+        ("dimension", _int), ("threads", _int), ("terms", ctypes.c_uint32),
+        ("weight", _int), ("form", _int), ("kernel", _int), ("support", _real), ("sigma", _real),
+        ("particles", _long), ("clusters", _long),
+        ("slot", _pointer), ("owner", _pointer), ("entries", _pointer), ("offset", _pointer), ("home", _pointer),
+        ("period", _real * 3), ("coefficients", _pointer),
+        ("position", _pointer), ("velocity", _pointer), ("mass", _pointer), ("deviation", _pointer),
+        ("pressure", _pointer), ("field", _pointer), ("active", _pointer),
+        ("divergence", _pointer), ("diffusion", _pointer), ("concentration", _pointer), ("xsph", _pointer),
+        ("acceleration", _pointer), ("shepard_volume", _pointer), ("shepard_mass", _pointer),
+        ("renormalisation", _pointer), ("laplacian", _pointer), ("diagonal", _pointer),
+    ]
+
+
+class InterpolationArguments(ctypes.Structure):
+    """sph_interpolation of csrc/interface.h."""
+
+    _fields_ = [
+        ("particles", SearchArguments), ("fields", _pointer), ("columns", _long), ("queries", _long),
+        ("query", _pointer), ("query_member", _pointer), ("kernel", _int), ("support", _real), ("sigma", _real),
+        ("lengths", _pointer), ("count", _pointer), ("value", _pointer), ("first", _pointer), ("second", _pointer),
+        ("field", _pointer), ("field_first", _pointer),
+    ]
+
+
+@dataclass(frozen=True)
+class Library:
+    """A loaded library and the instruction set it was compiled for."""
+
+    instruction_set: str
+    handle: ctypes.CDLL
+
+    def function(self, name: str, reals: str) -> ctypes._CFuncPtr:
+        """``name`` in the precision ``reals``: "f32" or "f64"."""
+        return getattr(self.handle, f"sph_{name}_{reals}")
+
+
+class LibraryMissing(RuntimeError):
+    """The compiled kernels cannot be used here; the message says why and what to do."""
+
+
+@lru_cache(maxsize=1)
+def library() -> Library:
+    """The library for the best instruction set of this processor, or for the one that ``TORCHSPH_ISA`` names.
+
+    Raises:
+        LibraryMissing: nothing was compiled, or the forced instruction set is unknown or not in this processor.
+    """
+    baseline = build.LIBRARIES / build.library_name("baseline")
+    if not baseline.is_file():
+        raise LibraryMissing(
+            f"the compiled kernels are not in {build.LIBRARIES}: the install found no C++ compiler. Install g++ or "
+            "clang++ and reinstall, or run 'python -m torchsph.pairs.build'"
+        )
+    runs = _load(baseline).sph_runs
+    forced = os.environ.get(FORCED)
+    if forced:
+        if forced not in PREFERENCE:
+            raise LibraryMissing(f"{FORCED}={forced} is unknown; known: {', '.join(PREFERENCE)}")
+        if not runs(forced.encode()):
+            raise LibraryMissing(f"{FORCED}={forced} asks for instructions that this processor lacks; unset it")
+        return _choose((forced,))
+    return _choose(tuple(isa for isa in PREFERENCE if runs(isa.encode())))
+
+
+def _choose(candidates: tuple[str, ...]) -> Library:
+    for isa in candidates:
+        path = build.LIBRARIES / build.library_name(isa)
+        if path.is_file():
+            return Library(isa, _declare(_load(path)))
+    raise LibraryMissing(f"no library for {', '.join(candidates)} in {build.LIBRARIES}; run 'python -m torchsph.pairs.build'")
+
+
+def _load(path: Path) -> ctypes.CDLL:
+    try:
+        return ctypes.CDLL(str(path))
+    except OSError as problem:
+        raise LibraryMissing(f"{path} cannot be loaded ({problem}); rebuild with 'python -m torchsph.pairs.build'") from problem
+
+
+def _declare(handle: ctypes.CDLL) -> ctypes.CDLL:
+    for reals in ("f32", "f64"):
+        getattr(handle, f"sph_sort_{reals}").argtypes = [ctypes.POINTER(SearchArguments), ctypes.POINTER(Sizes)]
+        listing = getattr(handle, f"sph_list_{reals}")
+        listing.argtypes = [ctypes.POINTER(SearchArguments), _long, ctypes.POINTER(ListArguments)]
+        listing.restype = _long
+        getattr(handle, f"sph_pass_{reals}").argtypes = [ctypes.POINTER(PassArguments)]
+        interpolate = getattr(handle, f"sph_interpolate_{reals}")
+        interpolate.argtypes, interpolate.restype = [ctypes.POINTER(InterpolationArguments)], _long
+    handle.sph_fma_peak.argtypes, handle.sph_fma_peak.restype = [_int, _long], _real
+    return handle
