@@ -21,8 +21,8 @@ def check(case, result, better=0.8):
 @pytest.mark.parametrize(
     ("name", "cycles"),
     [
-        ("L96 ETKF N24", 700),
-        ("L96 LETKF N7", 600),
+        ("L96 ETKF N24", 600),
+        ("L96 LETKF N7", 550),
         ("advection ETKF N30", 112),
         ("advection stochastic N30", 112),
     ],
@@ -34,7 +34,8 @@ def test_published_errors_in_short(name, cycles):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", list(CASES))
 def test_published_errors(name):
-    check(CASES[name], CASES[name].run(experiments=5, seed=1))
+    # Some runs lose the truth for a while (Lorenz-63, N 10): 15 of them make a steady median.
+    check(CASES[name], CASES[name].run(experiments=15, seed=1))
 
 
 def test_divergence_is_detected():

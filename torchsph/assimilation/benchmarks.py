@@ -39,7 +39,7 @@ class Benchmark:
     expected: float
     sectors: dict[str, tuple[torch.Tensor, float]]
 
-    def run(self, *, experiments: int = 5, seed: int = 0, cycles: int | None = None) -> TwinResult:
+    def run(self, *, experiments: int = 15, seed: int = 0, cycles: int | None = None) -> TwinResult:
         """The scores of independent repetitions; `cycles` shortens or lengthens the runs."""
         return run_twin(
             self.twin,

@@ -10,7 +10,7 @@ from torch import Tensor
 from .filters import EnsembleFilter, GlobalTransform, Transform
 from .observations import Observations, Screened
 from .rotation import need_generator
-from .subspace import update_weights, zero_sum_basis
+from .subspace import update_solution, zero_sum_basis
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,7 +41,6 @@ class StochasticEnKF(EnsembleFilter):
         modes = basis.mT @ anomalies
         gram = (modes * weight) @ modes.mT
         prior = (size - 1) * torch.eye(size - 1, dtype=torch.float64, device=anomalies.device)
-        _, root, signal = update_weights(prior, gram, gram.new_zeros(gram.shape[:-1]))
-        gain = root @ (root @ (modes @ scaled.mT))
+        gain, signal = update_solution(prior, gram, modes @ scaled.mT)
         unit = torch.eye(size, dtype=torch.float64, device=anomalies.device)
         return GlobalTransform(unit + basis @ gain), signal, screened.reason

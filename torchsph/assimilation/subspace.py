@@ -58,6 +58,20 @@ def update_weights(prior: Tensor, gram: Tensor, projected: Tensor) -> tuple[Tens
     return shift, root, signal
 
 
+def update_solution(prior: Tensor, gram: Tensor, right: Tensor) -> tuple[Tensor, Tensor]:
+    """`(U + gram)^-1 right` for `right (..., r, k)`, and the signal: `update_weights` where no root is
+    needed.
+    """
+    posterior = prior + gram
+    if not bool(torch.isfinite(posterior).all()):
+        raise AssimilationError("the update is not finite: NaN or overflow in the predicted observations")
+    factor, failed = torch.linalg.cholesky_ex(posterior)
+    if bool((failed != 0).any()):
+        raise AssimilationError("the prior precision of the error subspace is not positive definite")
+    inverse = torch.cholesky_inverse(factor)
+    return inverse @ right, (inverse * gram).sum((-2, -1))
+
+
 @dataclass(frozen=True)
 class ErrorSubspace:
     """Mean and covariance `P = L U^-1 L'` of a state of n numbers with r modes.
