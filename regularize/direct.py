@@ -30,6 +30,10 @@ class PreparedSystem:
         """Lower band (unknowns, width) of the normal matrix, float64."""
         return reference_band(self.system, self.ordering) if self._packed is None else self._packed.band()
 
+    def factor(self) -> "Factor":
+        """Cholesky factor of the normal matrix; InvalidInput where it is not positive definite."""
+        return Factor(self.band(), self.ordering)
+
     def gradient(self, x: torch.Tensor | None = None) -> torch.Tensor:
         """A'(b - A x) - damping^2 x, or A'b."""
         if self._packed is not None:
@@ -40,22 +44,23 @@ class PreparedSystem:
 
     def expand(self, x: torch.Tensor) -> torch.Tensor:
         """(active, C) in solve order -> (nodes, C) with zeros at untouched coefficients."""
-        full = torch.zeros(self.system.knots.nodes, *x.shape[1:], dtype=x.dtype)
-        full[self.ordering.nodes] = x
-        return full
+        return self.ordering.expand(x)
 
     def _take(self, full: torch.Tensor) -> torch.Tensor:
         return full.view(self.system.knots.nodes, self.system.components)[self.ordering.nodes]
 
 
 class Factor:
-    """Cholesky factor of a normal matrix; serves any right-hand sides of the same rows and weights."""
+    """Cholesky factor of a normal matrix; serves any right-hand sides of the same rows and weights.
 
-    def __init__(self, prepared: PreparedSystem) -> None:
-        self.ordering = prepared.ordering
-        band = prepared.band().numpy()
+    ``band`` (unknowns, width) is the lower band as in :func:`regularize.assembly.empty_band`; it is
+    overwritten.
+    """
+
+    def __init__(self, band: torch.Tensor, ordering: Ordering) -> None:
+        self.ordering = ordering
         try:
-            self.band = cholesky_banded(band.T, overwrite_ab=True, lower=True, check_finite=False)
+            self.band = cholesky_banded(band.numpy().T, overwrite_ab=True, lower=True, check_finite=False)
         except LinAlgError as error:
             raise InvalidInput(
                 "the normal matrix is not positive definite: some coefficients are fixed by no row; give a "
@@ -87,7 +92,7 @@ def solve_direct(
     rows, or of similar ones) is used instead of a new one. Raises NotConverged unless ``strict`` is False.
     """
     prepared = system if isinstance(system, PreparedSystem) else PreparedSystem(system)
-    factor = Factor(prepared) if factor is None else factor
+    factor = prepared.factor() if factor is None else factor
     right = prepared.gradient()
     scale = float(right.norm())
     if scale == 0:

@@ -7,6 +7,7 @@ import torch
 from .errors import InvalidInput
 from .knots import Knots
 from .krylov import Solution
+from .likelihood import Choice
 
 
 class SplineField:
@@ -23,9 +24,10 @@ class SplineField:
         covered: torch.Tensor,
         solution: Solution | None = None,
         left_out: int = 0,
+        choice: Choice | None = None,
     ) -> None:
         self.knots, self.coefficients, self.covered = knots, coefficients, covered
-        self.solution, self.left_out = solution, left_out
+        self.solution, self.left_out, self.choice = solution, left_out, choice
 
     @property
     def components(self) -> int:

@@ -75,6 +75,14 @@ class VectorRows(_PointRows):
             out.index_add_(0, self.knots.local_nodes(self.cell[part]).flatten(), values.flatten(0, 1))
         return out
 
+    def component(self, k: int) -> "VectorRows":
+        """The rows of one component, as rows of a scalar field."""
+        one = object.__new__(VectorRows)
+        one.knots, one.components, one.cell, one.t = self.knots, 1, self.cell, self.t
+        one.weight = self.weight[:, k : k + 1]
+        one.target = self.target.view(len(self), -1)[:, k].clone()
+        return one
+
 
 class _CoupledRows(_PointRows):
     """One row per point, touching all components of the local coefficients."""

@@ -30,6 +30,12 @@ class Ordering:
         """Place (n,) of cells (n, A) in ``keys``; they must be among them."""
         return torch.searchsorted(self.keys, self.key(cell))
 
+    def expand(self, x: torch.Tensor) -> torch.Tensor:
+        """(active, ...) in solve order -> (nodes, ...) with zeros at untouched coefficients."""
+        full = torch.zeros(self.knots.nodes, *x.shape[1:], dtype=x.dtype, device=x.device)
+        full[self.nodes] = x
+        return full
+
     def slabs(self) -> torch.Tensor:
         """(slabs + 1,) starts in ``keys`` of runs of degree + 1 cell layers along the slowest axis.
 

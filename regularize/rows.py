@@ -1,7 +1,7 @@
 """From checked samples and options to the row blocks of the system."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import prod
 from typing import TYPE_CHECKING
 
@@ -10,11 +10,12 @@ from scipy.spatial import ConvexHull, QhullError
 
 from .errors import InvalidInput
 from .knots import Knots
-from .operators import CellRows, DirectionRows, DivergenceRows, System, VectorRows
+from .operators import CellRows, DirectionRows, DivergenceRows, RowBlock, System, VectorRows
 from .penalties import curvature_gram, divergence_gram, row_factor
 from .walls import WallRows
 
 if TYPE_CHECKING:
+    from .likelihood import Choice
     from .smoother import Smoother
 
 
@@ -30,6 +31,7 @@ class FitData:
     lower: tuple[float, ...]
     upper: tuple[float, ...]
     left_out: int  # wall and divergence points beyond a given box
+    component_weight: torch.Tensor  # (C,) row factors, root mean square 1: components differ in noise
 
     @classmethod
     def checked(
@@ -77,7 +79,19 @@ class FitData:
             tuple(lower.tolist()),
             tuple(upper.tolist()),
             left_out,
+            torch.ones_like(points[0]),
         )
+
+    def reweighed(self, choice: "Choice") -> "FitData":
+        """With the robust factors and component noise that an automatic choice found."""
+        precision = torch.tensor(choice.noise, dtype=torch.float64) ** -2
+        each = (precision / precision.mean()).sqrt().to(self.points)
+        # discarded samples stay as rows of weight 0: the field remains defined where they lie
+        return replace(self, weight=self.weight * choice.robust.sqrt(), component_weight=each)
+
+    def extent(self, knots: Knots) -> float:
+        """Volume over which penalties are averaged: that of the data, or of one knot cell for flat data."""
+        return self.volume() or prod(knots.spacing)
 
     def volume(self) -> float:
         """Volume (area in 2-D) that samples and walls span, m^D; 0 where they lie in one plane."""
@@ -183,27 +197,40 @@ def _thesis_system(options: "Smoother", knots: Knots, data: FitData) -> System:
 
 def _density(options: "Smoother", knots: Knots, data: FitData) -> System:
     components = data.velocity.shape[1]
-    cell_volume = prod(knots.spacing)
-    volume = data.volume() or cell_volume
-    share = data.weight.double().square().sum().sqrt().to(data.weight)
-    blocks = [VectorRows(knots, data.points, data.velocity, (data.weight / share)[:, None])]
+    weight = data.weight[:, None] * data.component_weight
+    share = data.weight.double().square().sum().sqrt().to(weight)
+    fit = VectorRows(knots, data.points, data.velocity, weight / share)
+    blocks, _, damping = penalty_blocks(options, knots, data, [fit])
+    return System(knots, components, [fit, *blocks], damping)
+
+
+def penalty_blocks(
+    options: "Smoother", knots: Knots, data: FitData, fit: list[RowBlock]
+) -> tuple[list[RowBlock], torch.Tensor, float]:
+    """Rows of all penalties in the density scaling, the cells they cover, and the damping's row factor."""
+    components = data.velocity.shape[1]
+    extent = data.extent(knots)
+    blocks: list[RowBlock] = []
     if data.wall is not None and float(data.wall.weight.sum()) > 0:
-        root = (data.wall.weight / data.wall.weight.sum()).sqrt()
-        blocks += _wall_blocks(knots, data.wall, options.wall, options.no_slip, root)
+        blocks += _wall_blocks(knots, data.wall, options.wall, options.no_slip, wall_roots(data.wall))
     where = data.divergence_points
     if where is not None and len(where) and options.divergence:
         each = torch.full_like(where[:, 0], options.divergence / len(where) ** 0.5)
         blocks.append(DivergenceRows(knots, where, components, each))
-    cells = torch.unique(torch.cat([knots.cell_number(block.cell) for block in blocks]))
+    cells = torch.unique(torch.cat([knots.cell_number(block.cell) for block in [*fit, *blocks]]))
     cells = knots.cell_index(cells)
     if where is None and options.divergence:
         factor = row_factor(divergence_gram(knots, components), components).to(data.points)
-        blocks.append(CellRows(knots, cells, options.divergence / volume**0.5 * factor, components))
+        blocks.append(CellRows(knots, cells, options.divergence / extent**0.5 * factor, components))
     if options.curvature:
         factor = row_factor(curvature_gram(knots, range(knots.axes))).to(data.points)
-        blocks.append(CellRows(knots, cells, options.curvature**2 / volume**0.5 * factor, components))
-    damping = (options.damping or 0.0) * (cell_volume / volume) ** 0.5
-    return System(knots, components, blocks, damping)
+        blocks.append(CellRows(knots, cells, options.curvature**2 / extent**0.5 * factor, components))
+    return blocks, cells, (options.damping or 0.0) * (prod(knots.spacing) / extent) ** 0.5
+
+
+def wall_roots(wall: WallRows) -> torch.Tensor:
+    """(n,) row factors that turn sums over wall rows into means."""
+    return (wall.weight / wall.weight.sum()).sqrt()
 
 
 def _wall_blocks(

@@ -23,11 +23,14 @@ from .direct import solve_direct
 from .errors import InvalidInput
 from .field import SplineField
 from .krylov import lsqr
+from .robust import CUTOFFS
 from .rows import FitData, build_system, knots_for
+from .search import choose
 from .walls import WallRows
 
 SOLVERS = ("auto", "direct", "lsqr")
 SCALINGS = ("density", "thesis")
+AUTOMATIC = (None, "likelihood")
 
 
 @dataclass(frozen=True)
@@ -36,6 +39,11 @@ class Smoother:
 
     ``knots``: knot distance in m (or one per axis); ``nodes`` instead fixes the coefficients per axis,
     longest side first (table 4.1: 32, 16, 16). ``power``: samples' rows are multiplied by weight ** power.
+    ``automatic="likelihood"`` chooses curvature, no_slip and the noise of each velocity component from the
+    data (see ``likelihood``); the values given here are then the first guess, and are kept where fewer than
+    30 samples, or samples of no flow, leave nothing to choose from (``field.choice`` is None there).
+    ``robust``: "tukey" or "huber" reweighting of outliers, found together with that choice.
+    ``search_knots``: the choice is made on a grid this many times coarser, in at most ``rounds`` rounds.
     ``tolerance``: true relative gradient at which a solver may stop; NotConverged otherwise.
     """
 
@@ -45,9 +53,13 @@ class Smoother:
     divergence: float | None = 30e-3
     wall: float | None = 2.0
     no_slip: float | None = 0.5
-    curvature: float | None = 1.5e-3
+    curvature: float | None = 1e-3
     damping: float | None = 1e-3
     power: float = 1.0
+    automatic: str | None = "likelihood"
+    robust: str | None = "tukey"
+    search_knots: float = 4 / 3
+    rounds: int = 12
     scaling: str = "density"
     solver: str = "auto"
     tolerance: float = 1e-6
@@ -56,22 +68,32 @@ class Smoother:
     def __post_init__(self) -> None:
         if (self.knots is None) == (self.nodes is None):
             raise InvalidInput("give exactly one of knots (a distance in m) and nodes (a count per axis)")
-        if self.degree not in DEGREES:
-            raise InvalidInput(f"degree is {self.degree}: it must be one of {DEGREES}")
+        if self.nodes is not None and min(self.nodes) <= self.degree:
+            raise InvalidInput(f"nodes is {self.nodes}: each axis needs more than degree = {self.degree}")
         for name in ("divergence", "wall", "no_slip", "curvature", "damping"):
             value = getattr(self, name)
             if value is not None and not 0 <= value < float("inf"):
                 raise InvalidInput(f"{name} is {value}: it must be finite and >= 0, or None to switch it off")
         if self.power < 0:
             raise InvalidInput(f"power is {self.power}: it must be >= 0")
-        if self.solver not in SOLVERS:
-            raise InvalidInput(f"solver is {self.solver!r}: choose one of {SOLVERS}")
-        if self.scaling not in SCALINGS:
-            raise InvalidInput(f"scaling is {self.scaling!r}: choose one of {SCALINGS}")
-        if self.tolerance <= 0 or self.max_iterations < 1:
-            raise InvalidInput("tolerance must be > 0 and max_iterations >= 1")
-        if self.nodes is not None and min(self.nodes) <= self.degree:
-            raise InvalidInput(f"nodes is {self.nodes}: each axis needs more than degree = {self.degree}")
+        for name, known in (
+            ("degree", DEGREES),
+            ("solver", SOLVERS),
+            ("scaling", SCALINGS),
+            ("automatic", AUTOMATIC),
+            ("robust", (None, *CUTOFFS)),
+        ):
+            if getattr(self, name) not in known:
+                raise InvalidInput(f"{name} is {getattr(self, name)!r}: choose one of {known}")
+        if self.tolerance <= 0 or self.max_iterations < 1 or self.rounds < 1 or self.search_knots < 1:
+            raise InvalidInput("tolerance must be > 0; max_iterations, rounds and search_knots >= 1")
+        self._check_combinations()
+
+    def _check_combinations(self) -> None:
+        if self.automatic and (self.scaling == "thesis" or not self.curvature):
+            raise InvalidInput("automatic choice needs scaling='density' and a curvature > 0 to start from")
+        if self.robust and not self.automatic:
+            raise InvalidInput("robust reweighting runs within the automatic choice: set robust=None")
 
     @classmethod
     def preset(cls, name: str, **changes: object) -> "Smoother":
@@ -88,10 +110,16 @@ class Smoother:
                 curvature=None,
                 damping=0.5,
                 power=2.0,
+                automatic=None,
+                robust=None,
                 scaling="thesis",
             )
             return replace(table, **changes)
         raise InvalidInput(f"preset is {name!r}: choose 'default' or 'thesis'")
+
+    def fixed(self, **changes: object) -> "Smoother":
+        """The same options without automatic choice and reweighting, with ``changes``."""
+        return replace(self, automatic=None, robust=None, **changes)
 
     def fit(
         self,
@@ -112,7 +140,14 @@ class Smoother:
         """
         data = FitData.checked(points, velocity, weight, wall, divergence_points, box, self.power)
         knots = knots_for(data, self.knots, self.nodes, self.degree)
-        system = build_system(self, knots, data)
+        options, choice = self, None
+        if self.automatic == "likelihood":
+            choice = choose(self, knots, data)
+            options = self.fixed()
+        if choice is not None:
+            options = self.fixed(curvature=choice.curvature, no_slip=choice.no_slip)
+            data = data.reweighed(choice)
+        system = build_system(options, knots, data)
         if self.solver == "lsqr":
             solution = lsqr(
                 system.matvec,
@@ -127,4 +162,4 @@ class Smoother:
         coefficients = solution.x.to(data.velocity).view(knots.nodes, -1).T.reshape(-1, *knots.shape)
         covered = torch.zeros(prod(knots.cells), dtype=torch.bool)
         covered[system.cells()] = True
-        return SplineField(knots, coefficients, covered, solution, data.left_out)
+        return SplineField(knots, coefficients, covered, solution, data.left_out, choice)

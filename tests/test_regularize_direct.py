@@ -7,7 +7,6 @@ import torch
 from regularize_cases import blocks_of, make
 
 from regularize import (
-    Factor,
     InvalidInput,
     Knots,
     PreparedSystem,
@@ -53,7 +52,7 @@ def test_band_and_gradient_equal_dense_products(axes, degree, engine):
     assert torch.allclose(prepared.gradient(x).flatten(), gradient, atol=1e-10 * float(gradient.abs().max()))
     assert torch.allclose(prepared.gradient().flatten(), a.T @ system.target(), atol=1e-12)
     log_determinant = float(torch.linalg.slogdet(normal)[1])
-    assert Factor(prepared).log_determinant() == pytest.approx(log_determinant, rel=1e-10)
+    assert prepared.factor().log_determinant() == pytest.approx(log_determinant, rel=1e-10)
 
 
 @pytest.mark.parametrize("level", ["base", "avx2", "avx512"])
@@ -98,7 +97,7 @@ def test_direct_and_lsqr_equal_dense_least_squares(axes, degree):
 def test_factor_serves_many_right_hand_sides():
     knots, blocks = blocks_of(2)
     prepared = PreparedSystem(System(knots, 2, list(blocks.values()), 0.3))
-    factor, right = Factor(prepared), prepared.gradient()
+    factor, right = prepared.factor(), prepared.gradient()
     both = factor.solve(torch.stack([right, 2 * right], dim=-1))
     assert torch.allclose(both[..., 1], 2 * both[..., 0]) and torch.allclose(
         both[..., 0], factor.solve(right)

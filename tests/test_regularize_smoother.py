@@ -8,7 +8,8 @@ import torch
 
 from regularize import InvalidInput, Smoother, WallRows
 
-PLAIN = {"divergence": None, "wall": None, "no_slip": None, "curvature": None, "damping": 1e-9}
+GIVEN = {"automatic": None, "robust": None}  # the options as they stand
+PLAIN = {"divergence": None, "wall": None, "no_slip": None, "curvature": None, "damping": 1e-9, **GIVEN}
 
 
 def cloud(n=600, axes=3, seed=0):
@@ -58,23 +59,33 @@ def test_weight_power_means_weight_to_twice_the_power_in_the_cost():
         torch.rand(600, generator=torch.Generator().manual_seed(5), dtype=torch.float64) + 0.1,
     )
     velocity = rotation(points)
-    squared = Smoother(power=2.0).fit(points, velocity, w).coefficients
-    assert torch.allclose(squared, Smoother(power=1.0).fit(points, velocity, w**2).coefficients, atol=1e-10)
-    assert not torch.allclose(squared, Smoother(power=1.0).fit(points, velocity, w).coefficients, atol=1e-4)
+    squared = Smoother(power=2.0, **GIVEN).fit(points, velocity, w).coefficients
+    assert torch.allclose(
+        squared, Smoother(power=1.0, **GIVEN).fit(points, velocity, w**2).coefficients, atol=1e-10
+    )
+    assert not torch.allclose(
+        squared, Smoother(power=1.0, **GIVEN).fit(points, velocity, w).coefficients, atol=1e-4
+    )
 
 
 def test_doubled_samples_and_scaled_weights_change_nothing():
     points, velocity = cloud(), rotation(cloud())
-    once = Smoother().fit(points, velocity).coefficients
-    twice = Smoother().fit(points.repeat(2, 1), velocity.repeat(2, 1), torch.full((1200,), 0.5)).coefficients
+    once = Smoother(**GIVEN).fit(points, velocity).coefficients
+    twice = (
+        Smoother(**GIVEN)
+        .fit(points.repeat(2, 1), velocity.repeat(2, 1), torch.full((1200,), 0.5))
+        .coefficients
+    )
     assert torch.allclose(once, twice, atol=1e-9)
 
 
 def test_larger_box_changes_nothing_inside():
     points, velocity = cloud(), rotation(cloud())
     step, lower, upper = 3e-3, (0.0, 0.0, 0.0), (12e-3, 9e-3, 15e-3)
-    small = Smoother(knots=step).fit(points, velocity, box=(lower, upper))
-    wide = Smoother(knots=step).fit(points, velocity, box=([-2 * step] * 3, [u + 4 * step for u in upper]))
+    small = Smoother(knots=step, **GIVEN).fit(points, velocity, box=(lower, upper))
+    wide = Smoother(knots=step, **GIVEN).fit(
+        points, velocity, box=([-2 * step] * 3, [u + 4 * step for u in upper])
+    )
     assert torch.allclose(small(points), wide(points), atol=1e-8)
 
 
@@ -84,7 +95,7 @@ def test_moving_wall_right_hand_side():
     where, normals = sphere(400, 5e-3, centre)
     wall = WallRows(where, normals, 0.2 * normals, no_slip=torch.zeros(400, dtype=torch.bool))
     inside = sphere(200, 2e-3, centre)[0]
-    options = Smoother(divergence=None, wall=1e3, no_slip=None, curvature=0.5e-3)
+    options = Smoother(divergence=None, wall=1e3, no_slip=None, curvature=0.5e-3, **GIVEN)
     field = options.fit(inside, torch.zeros_like(inside), wall=wall)
     assert torch.allclose(
         (field(where) * normals).sum(1), torch.full((400,), 0.2, dtype=torch.float64), atol=5e-3
@@ -100,7 +111,7 @@ def test_no_slip_holds_the_whole_vector_and_only_where_asked():
     flow = torch.linalg.cross(
         inside - centre, torch.tensor([[0.0, 0, 50.0]], dtype=torch.float64).expand(300, 3)
     )
-    options = Smoother(divergence=None, wall=100.0, no_slip=100.0, curvature=0.2e-3)
+    options = Smoother(divergence=None, wall=100.0, no_slip=100.0, curvature=0.2e-3, **GIVEN)
     slip = torch.zeros(400, dtype=torch.bool)
     free = options.fit(inside, flow, wall=WallRows(where, normals, 0 * normals, no_slip=slip))
     held = options.fit(inside, flow, wall=WallRows(where, normals, 0 * normals, no_slip=~slip))
@@ -110,8 +121,8 @@ def test_no_slip_holds_the_whole_vector_and_only_where_asked():
 def test_strong_divergence_rows():
     points = cloud(2000)
     noisy = rotation(points) + 0.1 * torch.randn(2000, 3, generator=torch.Generator().manual_seed(0)).double()
-    field = Smoother(divergence=0.1).fit(points, noisy)
-    free = Smoother(divergence=None).fit(points, noisy)
+    field = Smoother(divergence=0.1, **GIVEN).fit(points, noisy)
+    free = Smoother(divergence=None, **GIVEN).fit(points, noisy)
     ratio = [f.divergence(points).norm() / f.gradient(points).norm() for f in (field, free)]
     assert ratio[0] < 0.1 * ratio[1]
 
@@ -170,7 +181,7 @@ def test_thesis_scaling_is_eq_3_22():
 
 def test_solvers_and_precisions_agree():
     points, velocity = cloud(), rotation(cloud())
-    options = Smoother(divergence=3e-3, damping=1e-2)
+    options = Smoother(divergence=3e-3, damping=1e-2, **GIVEN)
     direct = options.fit(points, velocity)(points)
     iterative = replace(options, solver="lsqr", tolerance=1e-8).fit(points, velocity)
     assert torch.allclose(iterative(points), direct, atol=1e-5)

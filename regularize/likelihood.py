@@ -1,0 +1,193 @@
+"""Noise levels, smoothness and slip chosen by restricted likelihood, without seeing any truth.
+
+Bayesian reading of the cost: every group of rows is Gaussian with a precision theta of its own: the samples
+of velocity component k (1 / sigma_k^2), the curvature (how rough the flow is), the slip at the wall. The
+restricted likelihood of all of them is maximised by the update of S. Wood and M. Fasiolo, Biometrics 73
+(2017) 1071 (generalised Fellner-Schall), which needs two factorisations and a few traces per round.
+
+Speckle noise is correlated over millimetres, and a likelihood that believes samples to be independent takes
+its long waves for flow. Here the samples count only through their unpenalised fit in the span of a knot grid
+somewhat coarser than the final one (as many data as coefficients, whatever the number of voxels): the noise
+level is read off scales that the spline resolves, where correlated noise looks white, and the residual at
+finer scales, which tells nothing about them, drops out.
+"""
+
+from dataclasses import dataclass
+
+import torch
+
+from .banded import multiply, widen
+from .direct import Factor, PreparedSystem
+from .knots import Knots
+from .operators import CellRows, RowBlock, System, VectorRows
+from .ordering import Ordering, order
+from .robust import robust_weight
+
+PROBES = 16  # Rademacher vectors per trace: its error is about sqrt(2 / (PROBES unknowns)), under 1 %
+RELAXATION = 1.6  # the plain update converges from one side at a rate near 0.6
+SETTLED = 0.03  # a round that changes no precision by more than this fraction ends the search
+FLOOR = 1e-3  # slip precisions below this share of the data's no longer matter
+NOISE_FLOOR = 1e-4  # of the data's root mean square: exact data would send the precision to infinity
+SHARPEST = 0.01  # curvature lengths stay between this many knot spacings and its inverse
+RIDGE = 0.02  # curvature length, in knot spacings, that keeps the unpenalised fit defined
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What the likelihood chose. Lengths in m, velocities in m/s.
+
+    ``noise`` (C): white-equivalent standard deviation, per component, of a sample of full weight (larger than
+    the point-wise one where the noise is correlated). ``curvature``, ``no_slip``: the Smoother's options of
+    that name. ``robust`` (n,): factors on the squared rows of the samples. ``rounds`` used; ``settled``: the
+    last one changed nothing of note.
+    """
+
+    noise: tuple[float, ...]
+    curvature: float
+    no_slip: float | None
+    robust: torch.Tensor
+    rounds: int
+    settled: bool
+
+
+@dataclass(frozen=True)
+class Groups:
+    """Rows on the search grid. Penalties are means over the fluid or the wall, as in the Smoother's cost."""
+
+    points: torch.Tensor  # (n, D) m
+    velocity: torch.Tensor  # (n, C) m/s
+    weight: torch.Tensor  # (n,) row weights
+    curvature: CellRows  # one component
+    slip: VectorRows | None  # the wall rows held in full, one weight per row
+    fixed: list[RowBlock]  # divergence and wall rows at the strength the options give
+    damping: float  # row factor
+
+
+class _Alike:
+    """A group that acts alike on every component: one scalar band serves them all."""
+
+    def __init__(self, block: VectorRows | CellRows, ordering: Ordering) -> None:
+        knots = ordering.knots
+        if isinstance(block, CellRows):
+            self.band = PreparedSystem(System(knots, 1, [block], 0.0), ordering).band()
+            self.right = self.size = 0.0
+            return
+        one = block.component(0)
+        self.band = PreparedSystem(System(knots, 1, [one], 0.0), ordering).band()
+        self.right = PreparedSystem(System(knots, block.components, [block], 0.0), ordering).gradient()
+        self.size = float(block.target.square().sum())
+
+    def times(self, x: torch.Tensor) -> torch.Tensor:
+        """Normal matrix times x (active, ...)."""
+        return multiply(self.band, x.reshape(len(x), -1)).view(x.shape)
+
+    def energy(self, x: torch.Tensor) -> float:
+        """Sum of the squared row residuals at x (active, C)."""
+        linear = 0.0 if isinstance(self.right, float) else float((x * self.right).sum())
+        return float((x * self.times(x)).sum()) - 2.0 * linear + self.size
+
+
+class LikelihoodSearch:
+    """Rounds of the Fellner-Schall update on one set of groups."""
+
+    def __init__(self, knots: Knots, groups: Groups, robust: str | None) -> None:
+        self.groups, self.robust, self.components = groups, robust, groups.velocity.shape[1]
+        fit = VectorRows(knots, groups.points, groups.velocity, groups.weight[:, None])
+        every = [fit, *groups.fixed] + ([] if groups.slip is None else [groups.slip])
+        self.ordering = order(System(knots, self.components, every, 0.0))
+        self.fit = fit
+        self.curvature = _Alike(groups.curvature, self.ordering)
+        self.slip = None if groups.slip is None else _Alike(groups.slip, self.ordering)
+        silent = VectorRows(knots, groups.points, groups.velocity, torch.zeros_like(groups.weight)[:, None])
+        fixed = System(knots, self.components, [silent, *groups.fixed], groups.damping)
+        fixed = PreparedSystem(fixed, self.ordering)
+        self.fixed, self.fixed_right = fixed.band(), fixed.gradient()
+        shape = (len(self.ordering.nodes), self.components, PROBES)
+        generator = torch.Generator().manual_seed(0)  # fixed probes: the same data give the same choice
+        self.probes = torch.randint(0, 2, shape, generator=generator).double() * 2 - 1
+        self.curvature_probes = self.curvature.times(self.probes)
+        self.slip_probes = None if self.slip is None else self.slip.times(self.probes)
+        self._weigh(torch.ones_like(groups.weight))
+        speed = float(groups.velocity.double().square().mean().sqrt())
+        self.sharpest = (NOISE_FLOOR * speed) ** -2
+
+    def run(self, noise: float, curvature: float, no_slip: float | None, rounds: int) -> Choice:
+        """Search from a first guess: noise in m/s, curvature in m, no_slip as in the Smoother's options."""
+        fit = torch.full((self.components,), noise**-2, dtype=torch.float64)
+        scale = self._scale(fit)
+        rough, slip = scale * curvature**4, 0.0
+        if self.slip is not None and no_slip is not None:
+            slip = scale * no_slip**2
+        settled, count = False, 0
+        while count < rounds and not settled:
+            count += 1
+            old = (fit, rough, slip)
+            fit, rough, slip = self._round(fit, rough, slip)
+            settled = self._settled(old, (fit, rough, slip))
+        scale = self._scale(fit)
+        chosen = (slip / scale) ** 0.5 if self.slip is not None and no_slip is not None else None
+        noise_each = tuple((fit**-0.5).tolist())
+        return Choice(noise_each, (rough / scale) ** 0.25, chosen, self.factor, count, settled)
+
+    def _round(self, fit: torch.Tensor, rough: float, slip: float) -> tuple[torch.Tensor, float, float]:
+        scale, one = self._scale(fit), torch.ones(self.components, dtype=torch.float64)
+        prior = scale * self.fixed + widen(self.curvature.band, rough * one)
+        right = scale * self.fixed_right + fit * self.data.right
+        if slip > 0:
+            prior += widen(self.slip.band, slip * one)
+            right = right + slip * self.slip.right
+        posterior = Factor(prior + widen(self.data.band, fit), self.ordering)
+        prior = Factor(prior, self.ordering)
+        x = posterior.solve(right)
+        known, all_known = prior.solve(self.probes), posterior.solve(self.probes)
+        # tr(A^-1 S_k): how much of component k's data the posterior leaves free
+        freed = (all_known * self.data.times(self.probes)).sum(dim=(0, 2)) / PROBES
+        off = x - self.unpenalised
+        misfit = (off * self.data.times(off)).sum(dim=0)
+        new_fit = (self.rank - fit * freed).clamp(min=1.0) / misfit.clamp(min=1e-300)
+        new_fit = new_fit.clamp(max=self.sharpest)
+        gained = known - all_known
+        ratio = float((gained * self.curvature_probes).sum()) / PROBES / self.curvature.energy(x)
+        coarse = max(self.fit.knots.spacing)
+        rough = min(
+            max(rough * ratio**RELAXATION, scale * (SHARPEST * coarse) ** 4), scale * (coarse / SHARPEST) ** 4
+        )
+        if slip > 0:
+            slip *= (float((gained * self.slip_probes).sum()) / PROBES / self.slip.energy(x)) ** RELAXATION
+        if self.robust is not None:
+            self._reweigh(x)
+        return new_fit, rough, slip
+
+    @staticmethod
+    def _step(gained: torch.Tensor, probed: torch.Tensor, energy: float) -> float:
+        """Factor on a penalty's precision: (tr(P^-1 G) - tr(A^-1 G)) over its energy, over-relaxed."""
+        trace = float((gained * probed).sum()) / PROBES
+        return (max(trace, 1e-300) / max(energy, 1e-300)) ** RELAXATION
+
+    def _scale(self, fit: torch.Tensor) -> float:
+        """Precision of the whole data set: what turns the Smoother's cost into a log-likelihood."""
+        return float(fit.mean() * (self.groups.weight.double().square() * self.factor).sum())
+
+    def _reweigh(self, x: torch.Tensor) -> None:
+        fitted = self.fit.matvec(self.ordering.expand(x)).view(-1, self.components)
+        residual = self.groups.velocity - fitted / self.groups.weight[:, None]
+        self._weigh(robust_weight(residual, self.robust))
+
+    def _weigh(self, factor: torch.Tensor) -> None:
+        """Take robust factors (n,) into the data group and its unpenalised fit."""
+        self.factor = factor
+        weight = self.groups.weight * factor.sqrt()
+        rows = VectorRows(self.fit.knots, self.groups.points, self.groups.velocity, weight[:, None])
+        self.data = _Alike(rows, self.ordering)
+        ridge = (RIDGE * max(self.fit.knots.spacing)) ** 4 * float(weight.double().square().sum())
+        factor = Factor(self.data.band + ridge * self.curvature.band, self.ordering)
+        self.unpenalised = factor.solve(self.data.right[:, None]).squeeze(1)
+        probe = self.probes[:, :1]
+        self.rank = float((factor.solve(probe) * self.data.times(probe)).sum()) / PROBES
+
+    @staticmethod
+    def _settled(old: tuple, new: tuple) -> bool:
+        fit = float(((new[0] - old[0]) / old[0]).abs().max())
+        rough = abs(new[1] / old[1] - 1.0)
+        slip = abs(new[2] - old[2]) / (old[2] + FLOOR * old[1] + 1e-300)
+        return max(fit, rough, slip) < SETTLED

@@ -1,0 +1,42 @@
+"""The automatic choice for one set of samples: row groups on a coarser grid, and the search on them."""
+
+from typing import TYPE_CHECKING
+
+import torch
+
+from .knots import Knots
+from .likelihood import Choice, Groups, LikelihoodSearch
+from .operators import CellRows, VectorRows
+from .penalties import curvature_gram, row_factor
+from .rows import FitData, penalty_blocks, wall_roots
+
+if TYPE_CHECKING:
+    from .smoother import Smoother
+
+FEWEST = 30  # below this the estimates scatter by more than the choice could gain
+
+
+def choose(options: "Smoother", knots: Knots, data: FitData) -> Choice | None:
+    """Choose noise levels, curvature, no_slip and robust factors for ``data`` (see ``likelihood``).
+
+    None where there is nothing to choose from: fewer than FEWEST samples, or no flow at all.
+    """
+    guess = 0.5 * float(data.velocity.double().square().mean().sqrt())
+    if len(data.points) < FEWEST or guess == 0:
+        return None
+    spacing = [options.search_knots * h for h in knots.spacing]
+    upper = [o + h * n for o, h, n in zip(knots.origin, knots.spacing, knots.cells, strict=True)]
+    coarse = Knots.covering(knots.origin, upper, spacing, knots.degree)
+    fit = VectorRows(coarse, data.points, data.velocity, data.weight[:, None])
+    blocks, cells, damping = penalty_blocks(options.fixed(no_slip=None, curvature=None), coarse, data, [fit])
+    slip = None
+    if options.no_slip and data.wall is not None and bool(data.wall.no_slip.any()):
+        wall, held = data.wall, data.wall.no_slip
+        slip = VectorRows(coarse, wall.points[held], wall.velocity[held], wall_roots(wall)[held, None])
+    factor = row_factor(curvature_gram(coarse, range(coarse.axes))) / data.extent(coarse) ** 0.5
+    groups = Groups(
+        data.points, data.velocity, data.weight, CellRows(coarse, cells, factor, 1), slip, blocks, damping
+    )
+    search = LikelihoodSearch(coarse, groups, options.robust)
+    with torch.no_grad():
+        return search.run(guess, options.curvature, options.no_slip, options.rounds)
