@@ -13,7 +13,7 @@ from .acquisition import Acquisition, Beams, Packet
 from .flow import Flow
 from .image import ParallelImager
 from .pointspread import GaussianPointSpread, PointSpread
-from .scatterers import Box, Cloud, advance, reseed, seed_cloud
+from .scatterers import Box, Cloud, carry, reseed, seed_cloud
 
 
 @dataclass(frozen=True)
@@ -77,8 +77,8 @@ def simulate_packet(
             iq += math.sqrt(noise) * imager.noise(generator)
         images.append(iq)
         if number + 1 < acquisition.packet:
-            moved = advance(cloud.position, flow, now, acquisition.interval)
-            cloud, _ = reseed(Cloud(moved, cloud.amplitude, cloud.tissue), box, flow, now, generator)
+            cloud = carry(cloud, box, flow, now, acquisition.interval, density, generator)
+            cloud = reseed(cloud, box, flow, now + acquisition.interval, density, generator)
     return Packet(torch.stack(images), grid, acquisition, model.beams, noise)
 
 

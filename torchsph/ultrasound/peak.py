@@ -11,6 +11,9 @@ import torch.nn.functional as F
 from torch import Tensor
 
 
+FIT_WEIGHTS = (1.0, 1.0, 0.1, 0.01)  # of nodes 0 to 3 steps off the middle
+
+
 @dataclass(frozen=True, eq=False)
 class Peak:
     """A correlation peak of each point; lags in nodes, in the order of the array's axes.
@@ -70,9 +73,16 @@ def _terms(offset: Tensor) -> Tensor:
 
 
 def _fit_matrix(axes: int) -> Tensor:
-    """(K, 3^A): least-squares coefficients of the quadratic from values on {-1, 0, 1}^A."""
+    """(K, 3^A): weighted least-squares coefficients of the quadratic from values on {-1, 0, 1}^A.
+
+    The further from the middle, the less a correlation is a quadratic: nodes off by one step on two or three axes
+    weigh 1/10 and 1/100. They are needed for the mixed derivatives alone; with equal weights their misfit made up
+    most of the lateral error on noise-free uniform motion.
+    """
     nodes = torch.tensor(list(product((-1.0, 0.0, 1.0), repeat=axes)), dtype=torch.float64)
-    return torch.from_numpy(np.linalg.pinv(_terms(nodes).numpy()))
+    steps = (nodes != 0).sum(1)
+    weight = nodes.new_tensor(FIT_WEIGHTS)[steps].sqrt()
+    return torch.from_numpy(np.linalg.pinv((_terms(nodes) * weight[:, None]).numpy())) * weight
 
 
 def _derivatives(terms: Tensor, axes: int) -> tuple[Tensor, Tensor]:

@@ -64,34 +64,60 @@ def advance(position: Tensor, flow: Flow, time: float, step: float) -> Tensor:
     return position + step / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
 
 
-def reseed(
-    cloud: Cloud, box: Box, flow: Flow, time: float, generator: torch.Generator, *, cell: float = 1e-3
-) -> tuple[Cloud, int]:
-    """Put scatterers that left the box, or crowd a cell, where density has fallen; returns how many.
+def carry(
+    cloud: Cloud, box: Box, flow: Flow, time: float, step: float, density: float, generator: torch.Generator
+) -> Cloud:
+    """The cloud at ``time + step``: moved, without those that left ``box``, and reseeded at the inflow.
 
-    Density is counted in cells of about ``cell`` metres. A cell gives away what exceeds the mean by three Poisson
-    deviations, and receives in proportion to what it lacks, so a uniform random cloud is left alone. The moved
-    ones are new scatterers: new amplitude, and blood or tissue by where they are put. Their number is constant.
+    What flows in is what came from outside: uniform random candidates whose path back leaves the box. So a cloud
+    that was uniform stays so, and no scatterer inside is disturbed.
     """
-    cells = [max(1, round(side / cell)) for side in box.sides]
-    inside = box.contains(cloud.position)
+    position = advance(cloud.position, flow, time, step)
+    inside = box.contains(position)
+    kept = Cloud(position[inside], cloud.amplitude[inside], cloud.tissue[inside])
+    candidates = _uniform(box, max(1, round(density * box.volume)), generator, position.dtype)
+    farthest = (position - cloud.position).norm(dim=1).max() * 1.5 if len(position) else 0.0
+    lower, upper = candidates.new_tensor(box.lower), candidates.new_tensor(box.upper)
+    rim = torch.minimum(candidates - lower, upper - candidates).amin(1) <= farthest
+    candidates = candidates[rim]
+    inflow = candidates[~box.contains(advance(candidates, flow, time + step, -step))]
+    return _joined(kept, _fresh(inflow, flow, time + step, generator))
+
+
+def reseed(
+    cloud: Cloud, box: Box, flow: Flow, time: float, density: float, generator: torch.Generator,
+    *, per_cell: float = 100.0,
+) -> Cloud:  # fmt: skip
+    """Even out a density that a flow has changed (per m^D): new scatterers in thin cells, fewer in crowded ones.
+
+    Cells hold ``per_cell`` scatterers on average. Only cells more than four Poisson deviations off are brought
+    back to the mean, so a uniform random cloud is left alone.
+    """
+    cells = [max(1, round(side * (density / per_cell) ** (1 / len(box.sides)))) for side in box.sides]
+    mean = density * box.volume / math.prod(cells)
     home = _cell_number(cloud.position, box, cells)
-    count = torch.bincount(home[inside], minlength=math.prod(cells)).to(cloud.position.dtype)
-    mean = len(home) / math.prod(cells)
-    surplus = (count - mean - 3 * math.sqrt(mean)).clamp_min(0)
-    leave = (surplus / count.clamp_min(1))[home]
-    chance = torch.rand(len(home), generator=generator, dtype=cloud.position.dtype, device=cloud.position.device)
-    moved = ~inside | (chance < leave)
-    number = int(moved.sum())
-    lacking = (mean - count).clamp_min(0)
-    if number == 0 or not lacking.any():
-        return cloud, 0
-    target = torch.multinomial(lacking.double(), number, replacement=True, generator=generator)
-    position, amplitude, tissue = cloud.position.clone(), cloud.amplitude.clone(), cloud.tissue.clone()
-    position[moved] = _in_cells(target, box, cells, generator, position)
-    amplitude[moved] = _amplitudes(number, generator, position.dtype)
-    tissue[moved] = ~flow.blood(position[moved], time)
-    return Cloud(position, amplitude, tissue), number
+    count = torch.bincount(home, minlength=math.prod(cells))
+    off = (count - mean).abs() > 4 * math.sqrt(mean)
+    leave = torch.where(off & (count > mean), 1 - mean / count.clamp_min(1), 0.0)[home]
+    chance = torch.rand(len(home), generator=generator, device=home.device)
+    stay = chance >= leave
+    kept = Cloud(cloud.position[stay], cloud.amplitude[stay], cloud.tissue[stay])
+    lacking = torch.where(off & (count < mean), mean - count, 0.0).round().long()
+    target = torch.repeat_interleave(torch.arange(len(lacking), device=home.device), lacking)
+    position = _in_cells(target, box, cells, generator, cloud.position)
+    return _joined(kept, _fresh(position, flow, time, generator))
+
+
+def _fresh(position: Tensor, flow: Flow, time: float, generator: torch.Generator) -> Cloud:
+    return Cloud(position, _amplitudes(len(position), generator, position.dtype), ~flow.blood(position, time))
+
+
+def _joined(first: Cloud, second: Cloud) -> Cloud:
+    return Cloud(
+        torch.cat([first.position, second.position]),
+        torch.cat([first.amplitude, second.amplitude]),
+        torch.cat([first.tissue, second.tissue]),
+    )
 
 
 def _uniform(box: Box, count: int, generator: torch.Generator, dtype: torch.dtype) -> Tensor:

@@ -144,6 +144,12 @@ class _Images:
     def real(self) -> torch.dtype:
         return self.power.dtype
 
+    def holds(self, nodes: Tensor) -> Tensor:
+        """Whether kernels around ``nodes`` (P, 3), and one node beyond, lie inside the image: (P,) bool."""
+        last = nodes.new_tensor([1] * (3 - self.packet.grid.dimension) + list(self.packet.grid.shape)) - 1
+        reach = nodes.new_tensor([h + (h > 0) for h in self.half])
+        return ((nodes >= reach) & (nodes + reach <= last)).all(1)
+
     def nearest_nodes(self, points: Tensor) -> Tensor:
         """Unpadded node numbers (n, 3), array order, of points (n, D)."""
         place = self.packet.grid.locate(points.double()).round().long().flip(-1).to(self.volume.device)
@@ -169,8 +175,7 @@ def _prepare(packet: Packet, options: SpeckleTracker) -> _Images:
     reach = options.search * packet.acquisition.interval * options.lags[0]
     half = [max(round(options.kernel / (2 * s)), (options.min_samples - 1) // 2) for s in spacing]
     search = [math.ceil(reach / s + 0.5 - 1e-9) for s in spacing]
-    # later lags look around a prediction: reach grows with the lag, plus the refinement's own node
-    margin = [h + math.ceil(1.5 * n * options.lags[-1] / options.lags[0]) + 3 for h, n in zip(half, search, strict=True)]
+    margin = [h + n for h, n in zip(half, search, strict=True)]
     lead = 3 - dimension
     pad = [0] * lead + margin
     edges = [side for m in reversed(pad) for side in (m, m)]
@@ -203,9 +208,9 @@ def _track_tile(
             break
         guess = state.motion * lag
         offset = (guess / images.spacing).round().long()
-        limit = nodes.new_tensor(images.margin) - nodes.new_tensor(images.half) - 2
-        offset = torch.minimum(torch.maximum(offset, -limit), limit)
-        state = state.better(_estimate(images, corner, offset, lag, fine, beam, state, options))
+        fits = images.holds(nodes + offset)
+        offset = torch.where(fits[:, None], offset, 0)
+        state = state.better(_estimate(images, corner, offset, lag, fine, beam, state, options), fits)
     active = list(images.active)
     interval = images.packet.acquisition.interval
     velocity = state.motion[:, active].flip(-1) / interval
@@ -262,9 +267,9 @@ class _State:
     lag: Tensor
     sound: Tensor
 
-    def better(self, other: _State) -> _State:
-        """Takes ``other`` where it is sound and promises a smaller total variance."""
-        take = other.sound & (~self.sound | (other.variance.sum(1) < self.variance.sum(1)))
+    def better(self, other: _State, allowed: Tensor) -> _State:
+        """Takes ``other`` where allowed (P,), sound and promising a smaller total variance."""
+        take = allowed & other.sound & (~self.sound | (other.variance.sum(1) < self.variance.sum(1)))
 
         def pick(name: str) -> Tensor:
             mine, theirs = getattr(self, name), getattr(other, name)
@@ -273,7 +278,7 @@ class _State:
         names = ("motion", "correlation", "curvature", "variance", "lag")
         # the ratio of peaks is that of the wide search: refinements see one peak alone
         return _State(
-            peak_ratio=self.peak_ratio, sound=self.sound | other.sound, **{name: pick(name) for name in names}
+            peak_ratio=self.peak_ratio, sound=self.sound | take, **{name: pick(name) for name in names}
         )
 
 
