@@ -172,7 +172,7 @@ class EnsembleFilter(ABC):
         state = (ensemble.shape[-1], state_positions)
         transform, signal, reason = self._transform(anomalies, screened, observations, state, generator)
         rotation = self._rotation(ensemble, generator)
-        analysed = self._finish(ensemble.double(), factor, transform, rotation)
+        analysed = self._finish(ensemble, factor, transform, rotation)
         variance = self._variance(analysed)
         before, after = self._variance(ensemble.double()).mean(-1).sqrt(), variance.mean(-1).sqrt()
         return Analysis(
@@ -218,11 +218,12 @@ class EnsembleFilter(ABC):
         self, ensemble: Tensor, factor: Tensor, transform: Transform, rotation: Tensor | None
     ) -> Tensor:
         """Prior inflation, transform, posterior inflation and rotation of the state, float64."""
-        mean = self._mean(ensemble).unsqueeze(-2)
-        prior = ensemble - mean
-        analysed = transform.apply(mean + prior * _column(factor, 2))
+        wide = ensemble.double()
+        mean = self._mean(wide).unsqueeze(-2)
+        prior = wide - mean
+        analysed = transform.apply((mean + prior * _column(factor, 2)).to(ensemble.dtype)).double()
         if transform.reached is not None:
-            analysed = torch.where(transform.reached, analysed, ensemble)
+            analysed = torch.where(transform.reached, analysed, wide)
         mean = self._mean(analysed).unsqueeze(-2)
         posterior = analysed - mean
         for part in self._inflations():

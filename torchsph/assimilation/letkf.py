@@ -194,13 +194,15 @@ class LocalTransform:
         """See `Transform.apply`."""
         wide = ensemble.double()
         mean = wide.mean(-2, keepdim=True)
-        modes = (wide.mT @ self.basis).contiguous()  # (*batch, n, r)
-        change = torch.zeros(*modes.shape[:-1], ensemble.shape[-2], dtype=torch.float64, device=wide.device)
+        # The modes are taken in float64; their products, the bulk of the work, in the state's precision.
+        modes = (wide.mT @ self.basis).to(ensemble.dtype)  # (*batch, n, r)
+        weights = self.weights.to(ensemble.dtype)
+        change = modes.new_zeros(*modes.shape[:-1], ensemble.shape[-2])
         for part in self.state.chunks(math.prod(modes.shape[:-2]) * ensemble.shape[-2]):
-            item, share = self.state.item[part], self.state.weight[part]
-            local = modes[..., item, :] @ self.weights[..., part, :, :]  # (*batch, p, K, N)
+            item, share = self.state.item[part], self.state.weight[part].to(ensemble.dtype)
+            local = modes[..., item, :] @ weights[..., part, :, :]  # (*batch, p, K, N)
             change.index_add_(-2, item.flatten(), (local * share.unsqueeze(-1)).flatten(-3, -2))
         if not bool(self.located.all()):
             free = ~self.located
-            change[..., free, :] = modes[..., free, :] @ self.average
+            change[..., free, :] = modes[..., free, :] @ self.average.to(ensemble.dtype)
         return (mean + change.mT).to(ensemble.dtype)
