@@ -95,6 +95,11 @@ class Domain:
             self._keys = (self.walls.key(early, self._open), self.walls.key(late, self._open))
         self.at(start)
 
+    def prepare_until(self, start: float, stop: float) -> None:
+        """Make the wall fields of a stretch of time (s) beforehand, so that the steps find them."""
+        for early, late in zip([start, *self.breaks(start, stop)], self.breaks(start, stop), strict=False):
+            self.enter(early, late)
+
     @property
     def open_regions(self) -> tuple[int, ...]:
         """Regions of the valves that are open in the present interval."""

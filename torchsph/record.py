@@ -58,6 +58,14 @@ class Record:
         self.smallest_density = torch.minimum(self.smallest_density, 1.0 + smallest.double())
         self.largest_density = torch.maximum(self.largest_density, 1.0 + largest.double())
 
+    def totals(self) -> dict[str, int]:
+        """Sums over members, for pooling the accounts of several runs."""
+        return {
+            "steps": int(self.steps.sum()), "failed": int(self.failed.sum()), "outside": int(self.outside.sum()),
+            "crossed_wall": int(self.crossed_wall.sum()), "inserted": int(self.inserted.sum()),
+            "removed": int(self.removed.sum()),
+        }
+
     def summary(self) -> dict[str, object]:
         """Plain numbers for metrics files: lists over members."""
         steps = {name: self.limited_by[:, k].tolist() for k, name in enumerate(LIMITS)}

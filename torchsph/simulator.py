@@ -226,18 +226,32 @@ class Simulation:
         self.particles = self.particles.changed(velocity=self.particles.velocity + change)
         return float(change.square().sum(1).mean().sqrt()) * self.units.speed
 
+    def mark_origins(self) -> None:
+        """Remember where every particle is now."""
+        self.particles = self.particles.changed(origin=self.particles.position)
+
+    def fetch_origins(self, grid: Grid, mask: Tensor) -> Tensor:
+        """Where the fluid at the nodes of ``mask`` was when it was marked, m: (members, D, *shape)."""
+        p = self.particles
+        moved = self._fetched(grid, mask, (p.position - p.origin) * self.units.length).value
+        nodes = grid.nodes(dtype=torch.float64, device=moved.device).T.reshape(1, grid.dimension, *grid.shape)
+        return nodes.to(moved.dtype) - moved
+
     def fetch(self, grid: Grid, mask: Tensor) -> Fetched:
         """Velocities at the nodes where ``mask`` (*shape): value (members, D, *shape), covered (members, *shape)."""
+        return self._fetched(grid, mask, self.particles.velocity * self.units.speed)
+
+    def _fetched(self, grid: Grid, mask: Tensor, carried: Tensor) -> Fetched:
         p = self.particles
         node = torch.nonzero(mask.reshape(-1)).squeeze(1)
         points = grid.nodes(dtype=torch.float64, device=p.position.device)[node] / self.units.length
         points = points.to(p.position.dtype).repeat(self.members, 1)
         owner = torch.arange(self.members, device=p.member.device).repeat_interleave(len(node))
-        found = fetch_at(points, owner, p.position, p.member, p.velocity, FETCH_RADIUS)
+        found = fetch_at(points, owner, p.position, p.member, carried, FETCH_RADIUS)
         dimension = grid.dimension
         value = p.velocity.new_zeros((self.members, dimension, grid.size))
         covered = torch.zeros((self.members, grid.size), dtype=torch.bool, device=p.member.device)
-        value[:, :, node] = found.value.reshape(self.members, len(node), dimension).transpose(1, 2) * self.units.speed
+        value[:, :, node] = found.value.reshape(self.members, len(node), dimension).transpose(1, 2)
         covered[:, node] = found.covered.reshape(self.members, len(node))
         shape = grid.shape
         return Fetched(value.reshape(self.members, dimension, *shape), covered.reshape(self.members, *shape))

@@ -6,6 +6,7 @@ from collections import OrderedDict
 
 import numpy as np
 import torch
+from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 from torch.nn import functional
 
@@ -18,6 +19,8 @@ from .walls import WallSample
 
 # look-up spacing in particle spacings: half of it resolves the kernel's share to a percent (test_walls)
 _FIELD_SPACING = 0.5
+# distances outside the wall are exact this far (spacings): particles are put back long before
+_STRAY = 1.5
 # key frames kept: the beat is run through in order, and a forecast of 40 ms spans about ten of them
 _KEPT = 24
 
@@ -79,15 +82,35 @@ class WallFields:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Distance (n,) from the closed part of the wall, positive in blood and open channels; velocity (n, D)."""
         nodes = self.grid.nodes().numpy()
-        inside = (grid_winding(self.grid, surface.vertices, surface.faces) > 0).reshape(-1)
+        inside = grid_winding(self.grid, surface.vertices, surface.faces) > 0
         shut = ~np.isin(surface.region, open_regions)
         solid = Surface(surface.vertices, surface.faces[shut], surface.region[shut])
-        band = (self.reach + 2.0) * self.spacing
-        found = SurfaceIndex(solid, self.spacing * _FIELD_SPACING).query(nodes, band=band)
-        distance = np.where(inside, found.distance, -found.distance)
+        near, donor = self._band(inside)
+        found = SurfaceIndex(solid, self.spacing * _FIELD_SPACING).query(nodes[near])
+        carried = found.interpolate(solid, velocity)[donor]
+        magnitude = found.distance[donor]
+        beyond = np.ones(len(nodes), bool)
+        beyond[near] = False
+        magnitude[beyond] += np.linalg.norm(nodes[beyond] - nodes[near[donor[beyond]]], axis=1)
+        inside = inside.reshape(-1)
+        distance = np.where(inside, magnitude, -magnitude)
         for region in open_regions:
-            distance = _with_channel(distance, nodes, inside, Orifice.of(surface, region), band)
-        return distance, found.interpolate(solid, velocity)
+            depth = (self.reach + 2.0) * self.spacing
+            distance = _with_channel(distance, nodes, inside, Orifice.of(surface, region), depth)
+        return distance, carried
+
+    def _band(self, inside: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Nodes near enough to the wall to need the exact distance, and for every node the nearest of them.
+
+        Inside as far as kernels see, outside as far as particles may stray; farther away a bound does.
+        """
+        step = _FIELD_SPACING
+        depth = np.where(inside, distance_transform_edt(inside), distance_transform_edt(~inside)) * step
+        close = depth < np.where(inside, self.reach + 0.5 + step, _STRAY + step)
+        donor = distance_transform_edt(~close, return_distances=False, return_indices=True)
+        number = np.cumsum(close.reshape(-1)) - 1
+        flat = np.ravel_multi_index(tuple(donor), close.shape).reshape(-1)
+        return np.flatnonzero(close), number[flat]
 
     def sample(self, first: Tensor, second: Tensor, fraction: Tensor, position: Tensor) -> WallSample:
         """Walls at positions (N, D), internal; ``fraction`` (N,) of the way from key fields ``first`` to ``second``."""

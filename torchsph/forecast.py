@@ -1,0 +1,202 @@
+"""Forecasting: impose a velocity grid, advance, fetch; and how good that is against a recording's later frames."""
+
+from __future__ import annotations
+
+import math
+import time as clock
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+import geometry
+
+from .simulator import Simulation, Simulator
+
+# frames count as the wanted lead within this (s); the files carry float64 seconds
+SAME_TIME = 1e-6
+
+
+@dataclass(frozen=True)
+class Transfer:
+    """How a grid forecast is put together from the particles.
+
+    Attributes:
+        fade: time (s) over which the correction below fades, or None for the plain fetch. Imposing and fetching
+            loses detail that the particles cannot carry; the forecast is the fetched field plus that loss (initial
+            grid minus the field fetched at once), times exp(-lead / fade). For noisy input use None: the loss is noise.
+        detail: whether the lost detail travels with the particles ("advected") or stays where it was ("static").
+    """
+
+    fade: float | None = 0.015
+    detail: str = "advected"
+
+    def __post_init__(self) -> None:
+        if self.fade is not None and not self.fade > 0:
+            raise ValueError(f"Transfer.fade must be positive (s) or None, got {self.fade}")
+        if self.detail not in ("advected", "static"):
+            raise ValueError(f"Transfer.detail must be 'advected' or 'static', got '{self.detail}'")
+
+
+class GridForecast:
+    """A forecast on its way: starts from velocity grids of all members, gives velocity grids at later times.
+
+    Args:
+        model: the simulator. grid, mask (*shape) bool: where the velocity is known at ``time`` (s).
+        velocity: (D, *shape) for one member or (members, D, *shape), m/s.
+    """
+
+    def __init__(
+        self, model: Simulator, grid: geometry.Grid, velocity: Tensor, mask: Tensor, time: float,
+        transfer: Transfer, *, seed: int = 0,
+    ) -> None:
+        batched = velocity if velocity.ndim == grid.dimension + 2 else velocity[None]
+        self.grid, self.transfer, self.start_time = grid, transfer, time
+        self.run: Simulation = model.start(time, members=batched.shape[0], seed=seed)
+        self.run.impose(grid, batched, mask)
+        self._lost: Tensor | None = None
+        if transfer.fade is not None:
+            kept = self.run.fetch(grid, mask)
+            known = mask & kept.covered
+            self._lost = torch.where(known[:, None], batched.to(kept.value) - kept.value, torch.zeros_like(kept.value))
+            if transfer.detail == "advected":
+                self.run.mark_origins()
+
+    def at(self, time: float, mask: Tensor) -> tuple[Tensor, Tensor]:
+        """Advance to ``time`` (s) and fetch at the nodes of ``mask``.
+
+        Returns velocity (members, D, *shape), m/s, 0 where uncovered, and covered (members, *shape) bool.
+        """
+        self.run.advance(time)
+        found = self.run.fetch(self.grid, mask)
+        if self._lost is None:
+            return found.value, found.covered
+        share = math.exp(-(time - self.start_time) / self.transfer.fade)
+        detail = self._lost
+        if self.transfer.detail == "advected":
+            origin = self.run.fetch_origins(self.grid, mask).flatten(2).transpose(1, 2)
+            detail = self.grid.sample(self._lost, origin, outside="zero").reshape(self._lost.shape)
+        return found.value + share * detail * found.covered[:, None], found.covered
+
+
+@dataclass(frozen=True)
+class ForecastSkill:
+    """Errors of forecasts against lead time.
+
+    Attributes:
+        leads: one entry per lead: ``{"lead": s, "starts": n, "nrmse": {"model": x, "persistence": y}}``.
+        seconds: ``{"setup": s, "forecast": s}``. config: what was run.
+        recordings: the forecasts of each lead, valid at their time; empty unless they were asked for.
+        info: accounts of the runs.
+    """
+
+    leads: list[dict[str, Any]]
+    seconds: dict[str, float]
+    config: dict[str, Any]
+    recordings: dict[float, geometry.Recording] = field(default_factory=dict)
+    info: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass
+class _Sums:
+    """Pooled squares of one lead: model error, persistence error, reference; and the number of starts."""
+
+    model: float = 0.0
+    persistence: float = 0.0
+    reference: float = 0.0
+    starts: int = 0
+
+    def add(self, forecast: np.ndarray, start: np.ndarray, truth: np.ndarray, both: np.ndarray) -> None:
+        def total(field: np.ndarray) -> float:
+            return float(np.sum(np.square(field[:, both], dtype=np.float64)))
+
+        self.model += total(forecast - truth)
+        self.persistence += total(start - truth)
+        self.reference += total(truth)
+        self.starts += 1
+
+    def nrmse(self) -> dict[str, float]:
+        scale = self.reference if self.reference > 0 else math.nan
+        return {"model": math.sqrt(self.model / scale), "persistence": math.sqrt(self.persistence / scale)}
+
+
+def skill(
+    recording: geometry.Recording, model: Simulator, leads: Sequence[float], *, every: int = 1,
+    transfer: Transfer | None = None, save: bool = False, progress: bool = False, seed: int = 0,
+) -> ForecastSkill:
+    """Forecast from every ``every``-th frame and compare with the frames ``leads`` (s) later.
+
+    Errors are pooled over all starts and over all nodes inside both masks; uncovered nodes count as zero velocity.
+    A recording with ``weight`` is noisy: ``transfer`` then defaults to the plain fetch.
+
+    Raises ValueError where no frame lies a lead after a start.
+    """
+    if transfer is None:
+        transfer = Transfer() if recording.weight is None else Transfer(fade=None)
+    targets = _targets(recording, leads, every)
+    sums = {lead: _Sums() for lead in leads}
+    kept: dict[float, list[tuple[int, np.ndarray, int]]] = {lead: [] for lead in leads}
+    seconds = {"setup": 0.0, "forecast": 0.0}
+    totals: dict[str, float] = {}
+    bar = tqdm(sorted(targets), desc="forecast", unit="start", disable=None if progress else True)
+    for start in bar:
+        _from_one_start(recording, model, start, targets[start], transfer, seed, sums, kept if save else None,
+                        seconds, totals)
+    rows = [{"lead": lead, "starts": sums[lead].starts, "nrmse": sums[lead].nrmse()} for lead in leads]
+    saved = {lead: _as_recording(recording, frames, lead) for lead, frames in kept.items() if frames}
+    config = {"spacing": model.scene.spacing, "scheme": repr(model.scheme), "transfer": repr(transfer)}
+    return ForecastSkill(rows, seconds, config, saved, totals)
+
+
+def _targets(recording: geometry.Recording, leads: Sequence[float], every: int) -> dict[int, dict[float, int]]:
+    """Frame of each lead for every start that has at least one."""
+    found: dict[int, dict[float, int]] = {}
+    for start in range(0, recording.frames, every):
+        for lead in leads:
+            gap = np.abs(recording.time - recording.time[start] - lead)
+            if gap.min() < SAME_TIME:
+                found.setdefault(start, {})[lead] = int(gap.argmin())
+    for lead in leads:
+        if not any(lead in frames for frames in found.values()):
+            raise ValueError(f"no frame of the recording lies {lead:g} s after a start; choose other leads or starts")
+    return found
+
+
+def _from_one_start(
+    recording: geometry.Recording, model: Simulator, start: int, frames: dict[float, int], transfer: Transfer,
+    seed: int, sums: dict[float, _Sums], kept: dict[float, list] | None, seconds: dict[str, float],
+    totals: dict[str, float],
+) -> None:
+    began = clock.perf_counter()
+    velocity, mask = recording.velocity, np.asarray(recording.mask, bool)
+    initial = np.where(mask[start], np.nan_to_num(velocity[start]), 0.0)
+    known = torch.from_numpy(mask[start] & np.isfinite(velocity[start]).all(0))
+    model.domain.prepare_until(float(recording.time[start]), float(recording.time[max(frames.values())]))
+    going = GridForecast(
+        model, recording.grid, torch.from_numpy(initial), known.to(model.device), float(recording.time[start]),
+        transfer, seed=seed,
+    )
+    seconds["setup"] += clock.perf_counter() - began
+    for lead, frame in sorted(frames.items()):
+        began = clock.perf_counter()
+        value, covered = going.at(float(recording.time[frame]), torch.from_numpy(mask[frame]).to(model.device))
+        field_, missing = value[0].cpu().numpy(), int((mask[frame] & ~covered[0].cpu().numpy()).sum())
+        seconds["forecast"] += clock.perf_counter() - began
+        later = np.where(mask[frame], np.nan_to_num(velocity[frame]), 0.0)
+        sums[lead].add(field_, initial, later, mask[start] & mask[frame])
+        if kept is not None:
+            kept[lead].append((frame, field_.astype(np.float32), missing))
+    for name, value in going.run.record.totals().items():
+        totals[name] = totals.get(name, 0) + value
+
+
+def _as_recording(recording: geometry.Recording, frames: list, lead: float) -> geometry.Recording:
+    chosen = recording.select(np.array([frame for frame, _, _ in frames]))
+    return chosen.with_velocity(
+        np.stack([one for _, one, _ in frames]), uncovered=np.array([n for _, _, n in frames], np.int64),
+        description=f"forecast {1e3 * lead:g} ms ahead",
+    )
