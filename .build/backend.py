@@ -26,8 +26,11 @@ from setuptools.build_meta import (  # noqa: F401  (hooks that need no change)
     prepare_metadata_for_build_editable,
     prepare_metadata_for_build_wheel,
 )
+from setuptools.command.egg_info import manifest_maker
 
 ROOT = Path(__file__).resolve().parents[1]
+# what a source distribution carries beside the packages; kept here because the top level is for the packages
+manifest_maker.template = ".build/MANIFEST.in"
 # the script whose build(folder) compiles, and the package folder that the libraries go to
 NATIVE = (("torchsph/pairs/build.py", "torchsph/_native"), ("regularize/native_build.py", "regularize"))
 

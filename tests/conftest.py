@@ -15,12 +15,9 @@ ROOT = Path(__file__).resolve().parents[1]
 
 def _prefer_installed() -> None:
     """Test what was installed: `python -m pytest` puts the checkout first, which has no compiled kernels."""
-    try:
-        folder = Path(str(metadata.distribution("torchsph").locate_file(""))).resolve()
-    except metadata.PackageNotFoundError:
-        return
-    if folder != ROOT:
-        sys.path[:] = [entry for entry in sys.path if Path(entry or os.getcwd()).resolve() != ROOT]
+    elsewhere = [entry for entry in sys.path if Path(entry or os.getcwd()).resolve() != ROOT]
+    if any(metadata.distributions(name="torchsph", path=elsewhere)):
+        sys.path[:] = elsewhere
 
 
 _prefer_installed()
