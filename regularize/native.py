@@ -12,7 +12,7 @@ from pathlib import Path
 import torch
 
 from .assembly import cell_gram, empty_band
-from .bspline import basis
+from .bspline import pieces
 from .operators import CellRows, DirectionRows, DivergenceRows, RowBlock, System, VectorRows
 from .ordering import Ordering, local_permutation
 
@@ -27,6 +27,8 @@ class _Grid(ctypes.Structure):
         ("degree", ctypes.c_int32),
         ("padded", ctypes.c_int32),
         ("axis_of_component", ctypes.c_int32 * 4),
+        ("spacing", ctypes.c_double * 4),
+        ("pieces", ctypes.c_double * 36),
         ("cells", ctypes.c_int64),
         ("nodes", ctypes.c_int64),
         ("position", ctypes.c_void_p),
@@ -39,8 +41,7 @@ class _Rows(ctypes.Structure):
         ("shared", ctypes.c_int32),
         ("count", ctypes.c_int64),
         ("start", ctypes.c_void_p),
-        ("value", ctypes.c_void_p),
-        ("slope", ctypes.c_void_p),
+        ("t", ctypes.c_void_p),
         ("coefficient", ctypes.c_void_p),
         ("gram", ctypes.c_void_p),
     ]
@@ -85,6 +86,8 @@ class PackedSystem:
             degree=knots.degree,
             padded=-(-knots.local_size // tile) * tile,
             axis_of_component=(ctypes.c_int32 * 4)(*place),
+            spacing=(ctypes.c_double * 4)(*[knots.spacing[k] for k in ordering.axes]),
+            pieces=(ctypes.c_double * 36)(*pieces(knots.degree).flatten()),
             cells=len(ordering.keys),
             nodes=len(ordering.nodes),
             position=self._pointer(ordering.position.int()),
@@ -152,18 +155,12 @@ class PackedSystem:
             coefficient = weight[:, None] * block.direction[index].double()
         else:
             coefficient = weight[:, None].repeat(1, block.components)
-        t = block.t[index][:, list(self.ordering.axes)].double()
-        slope = None
-        if isinstance(block, DivergenceRows):
-            spacing = torch.tensor([block.knots.spacing[k] for k in self.ordering.axes], dtype=torch.float64)
-            slope = self._pointer(basis(t, block.knots.degree, 1) / spacing[:, None])
         return _Rows(
             kind=KINDS[type(block)],
             shared=shared,
             count=len(block),
             start=self._pointer(start),
-            value=self._pointer(basis(t, block.knots.degree)),
-            slope=slope,
+            t=self._pointer(block.t[index][:, list(self.ordering.axes)].double()),
             coefficient=self._pointer(coefficient),
         )
 

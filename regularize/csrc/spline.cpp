@@ -29,6 +29,7 @@ constexpr int kCols = 2 * kWidth;     // tile columns: two vectors
 constexpr int kDepth = 32;            // points whose stencils are buffered before they are summed
 constexpr int kMaxComponents = 3;
 constexpr int kMaxAxes = 4;
+constexpr int kMaxOrder = 6;  // degree + 1
 
 enum Kind : int32_t { kVector = 0, kDirection = 1, kDivergence = 2, kCellScalar = 3, kCellCoupled = 4 };
 
@@ -39,6 +40,8 @@ extern "C" {
 struct SplineGrid {
   int32_t axes, components, degree, padded;  // padded: local coefficients rounded up to the tile width
   int32_t axis_of_component[kMaxAxes];       // place of component k's own axis among the solve axes
+  double spacing[kMaxAxes];                  // knot distance along the solve axes, m
+  double pieces[kMaxOrder * kMaxOrder];      // (degree + 1, degree + 1) powers of t of each basis function
   int64_t cells, nodes;                      // cells that hold rows, active coefficients
   const int32_t* position;                   // (cells, local) solve positions, rising within a cell
 };
@@ -47,8 +50,7 @@ struct SplineRows {
   int32_t kind, shared;      // shared: all components have the same weight (kVector)
   int64_t count;             // rows' points; 0 for the cell kinds
   const int64_t* start;      // (cells + 1) points of each cell; for the cell kinds 0 or 1 blocks
-  const double* value;       // (count, axes, degree + 1)
-  const double* slope;       // the same, derivative per metre (kDivergence only)
+  const double* t;           // (count, axes) local coordinates, slowest solve axis first
   const double* coefficient; // (count, components): weight, weight * direction, or weight in column 0
   const double* gram;        // (local, local), or (C, C, local, local) for kCellCoupled
 };
@@ -63,13 +65,34 @@ int local_size(const SplineGrid& g) {
   return size;
 }
 
-// Products of the 1-D values of point n; the 1-D derivative on one axis (or -1 for none), times scale.
-void stencil(const SplineGrid& g, const SplineRows& rows, int64_t n, int derived, double scale, double* out) {
+// 1-D basis values of one point, and their derivatives per metre.
+struct Basis {
+  double value[kMaxAxes][kMaxOrder], slope[kMaxAxes][kMaxOrder];
+
+  Basis(const SplineGrid& g, const double* t, bool slopes) {
+    const int order = g.degree + 1;
+    for (int a = 0; a < g.axes; ++a) {
+      for (int i = 0; i < order; ++i) {
+        const double* powers = g.pieces + i * order;
+        double v = 0, s = 0;
+        for (int k = order - 1; k >= 0; --k) {  // Horner for the polynomial and its derivative together
+          s = s * t[a] + v;
+          v = v * t[a] + powers[k];
+        }
+        value[a][i] = v;
+        if (slopes) slope[a][i] = s / g.spacing[a];
+      }
+    }
+  }
+};
+
+// Products of 1-D values; the 1-D derivative on one axis (or -1 for none), times scale.
+void stencil(const SplineGrid& g, const Basis& basis, int derived, double scale, double* out) {
   const int order = g.degree + 1;
   out[0] = scale;
   int size = 1;
   for (int a = 0; a < g.axes; ++a) {
-    const double* one = (a == derived ? rows.slope : rows.value) + (n * g.axes + a) * order;
+    const double* one = a == derived ? basis.slope[a] : basis.value[a];
     for (int i = size - 1; i >= 0; --i) {  // downwards: the products are expanded in place
       const double left = out[i];
       for (int k = 0; k < order; ++k) out[i * order + k] = left * one[k];
@@ -79,11 +102,11 @@ void stencil(const SplineGrid& g, const SplineRows& rows, int64_t n, int derived
 }
 
 // The row of component k at point n, without the weight of kVector rows.
-void row_of(const SplineGrid& g, const SplineRows& rows, int64_t n, int k, double* out) {
+void row_of(const SplineGrid& g, const SplineRows& rows, const Basis& basis, int64_t n, int k, double* out) {
   const double* c = rows.coefficient + n * g.components;
-  if (rows.kind == kVector) stencil(g, rows, n, -1, 1.0, out);
-  else if (rows.kind == kDirection) stencil(g, rows, n, -1, c[k], out);
-  else stencil(g, rows, n, g.axis_of_component[k], c[0], out);
+  if (rows.kind == kVector) stencil(g, basis, -1, 1.0, out);
+  else if (rows.kind == kDirection) stencil(g, basis, -1, c[k], out);
+  else stencil(g, basis, g.axis_of_component[k], c[0], out);
 }
 
 // out[m][l] += sum_k p[k][m] q[k][l] over tiles with l >= m, p and q (depth, padded).
@@ -112,7 +135,7 @@ void add_products(const double* p, const double* q, int depth, int padded, doubl
 // Gram blocks of one cell: pair[d][c][m][l] belongs to unknowns (m, d) and (l, c); shared is added for c == d.
 struct CellGram {
   int components, padded;
-  std::vector<double> pair, shared, panel;
+  std::vector<double> pair, shared, panel;  // the panels' padding stays 0
   bool has_pairs[kMaxComponents][kMaxComponents];
   bool has_shared;
 
@@ -145,12 +168,13 @@ void add_point_rows(const SplineGrid& g, const SplineRows& rows, int64_t begin, 
   for (int64_t first = begin; first < end; first += kDepth) {
     const int depth = int(std::min<int64_t>(kDepth, end - first));
     const int panels = vector && rows.shared ? 1 : g.components;
-    for (int c = 0; c < panels; ++c) {
-      for (int k = 0; k < depth; ++k) {
+    for (int k = 0; k < depth; ++k) {
+      const int64_t n = first + k;
+      const Basis basis(g, rows.t + n * g.axes, rows.kind == kDivergence);
+      for (int c = 0; c < panels; ++c) {
         double* row = cell.panel.data() + c * panel + size_t(k) * padded;
-        std::fill_n(row, padded, 0.0);
-        if (vector) stencil(g, rows, first + k, -1, rows.coefficient[(first + k) * g.components + c], row);
-        else row_of(g, rows, first + k, c, row);
+        if (vector) stencil(g, basis, -1, rows.coefficient[n * g.components + c], row);
+        else row_of(g, rows, basis, n, c, row);
       }
     }
     const double* p = cell.panel.data();
@@ -196,16 +220,27 @@ void scatter(const SplineGrid& g, int64_t cell_number, int local, CellGram& cell
   }
 }
 
-// dot and axpy over one point's row; x and out are (nodes, components) in solve order
-double dot_row(const SplineGrid& g, const int32_t* position, int local, const double* row, int k, const double* x) {
+double dot(const double* a, const double* b, int count) {
   double sum = 0;
-  for (int l = 0; l < local; ++l) sum += row[l] * x[int64_t(position[l]) * g.components + k];
+#pragma omp simd reduction(+ : sum)
+  for (int l = 0; l < count; ++l) sum += a[l] * b[l];
   return sum;
 }
 
-void add_row(const SplineGrid& g, const int32_t* position, int local, const double* row, int k, double scale,
-             double* out) {
-  for (int l = 0; l < local; ++l) out[int64_t(position[l]) * g.components + k] += scale * row[l];
+void add_scaled(const double* row, double scale, int count, double* out) {
+#pragma omp simd
+  for (int l = 0; l < count; ++l) out[l] += scale * row[l];
+}
+
+// A cell's coefficients (components, local) out of x (nodes, components), and back by addition.
+void gather(const SplineGrid& g, const int32_t* position, int local, const double* x, double* near) {
+  for (int k = 0; k < g.components; ++k)
+    for (int l = 0; l < local; ++l) near[k * local + l] = x[int64_t(position[l]) * g.components + k];
+}
+
+void scatter_add(const SplineGrid& g, const int32_t* position, int local, const double* near, double* x) {
+  for (int k = 0; k < g.components; ++k)
+    for (int l = 0; l < local; ++l) x[int64_t(position[l]) * g.components + k] += near[k * local + l];
 }
 
 }  // namespace
@@ -264,23 +299,25 @@ void spline_gram(const SplineGrid* grid, const SplineRows* blocks, int32_t block
 // out (count or count * C) = rows times x (nodes, C)
 void spline_apply(const SplineGrid* grid, const SplineRows* rows, const double* x, double* out) {
   const SplineGrid& g = *grid;
-  const int local = local_size(g);
+  const int local = local_size(g), c = g.components;
+  const bool vector = rows->kind == kVector;
 #pragma omp parallel
   {
-    std::vector<double> row(g.padded);
+    std::vector<double> row(local), near(size_t(local) * c);
 #pragma omp for schedule(static)
     for (int64_t number = 0; number < g.cells; ++number) {
-      const int32_t* position = g.position + number * local;
+      if (rows->start[number] == rows->start[number + 1]) continue;
+      gather(g, g.position + number * local, local, x, near.data());
       for (int64_t n = rows->start[number]; n < rows->start[number + 1]; ++n) {
-        double sum = 0;
-        if (rows->kind == kVector) stencil(g, *rows, n, -1, 1.0, row.data());
-        for (int k = 0; k < g.components; ++k) {
-          if (rows->kind != kVector) row_of(g, *rows, n, k, row.data());
-          const double part = dot_row(g, position, local, row.data(), k, x);
-          if (rows->kind == kVector) out[n * g.components + k] = rows->coefficient[n * g.components + k] * part;
-          sum += part;
+        const Basis basis(g, rows->t + n * g.axes, rows->kind == kDivergence);
+        if (vector) stencil(g, basis, -1, 1.0, row.data());
+        else out[n] = 0;
+        for (int k = 0; k < c; ++k) {
+          if (!vector) row_of(g, *rows, basis, n, k, row.data());
+          const double part = dot(row.data(), near.data() + k * local, local);
+          if (vector) out[n * c + k] = rows->coefficient[n * c + k] * part;
+          else out[n] += part;
         }
-        if (rows->kind != kVector) out[n] = sum;
       }
     }
   }
@@ -289,22 +326,25 @@ void spline_apply(const SplineGrid* grid, const SplineRows* rows, const double* 
 // out (nodes, C) += rows' times r (count or count * C)
 void spline_adjoint(const SplineGrid* grid, const SplineRows* rows, const double* r, double* out) {
   const SplineGrid& g = *grid;
-  const int local = local_size(g);
+  const int local = local_size(g), c = g.components;
+  const bool vector = rows->kind == kVector;
 #pragma omp parallel
   {
-    std::vector<double> row(g.padded), mine(size_t(g.nodes) * g.components);
+    std::vector<double> row(local), near(size_t(local) * c), mine(size_t(g.nodes) * c);
 #pragma omp for schedule(static)
     for (int64_t number = 0; number < g.cells; ++number) {
-      const int32_t* position = g.position + number * local;
+      if (rows->start[number] == rows->start[number + 1]) continue;
+      std::fill(near.begin(), near.end(), 0.0);
       for (int64_t n = rows->start[number]; n < rows->start[number + 1]; ++n) {
-        if (rows->kind == kVector) stencil(g, *rows, n, -1, 1.0, row.data());
-        for (int k = 0; k < g.components; ++k) {
-          if (rows->kind != kVector) row_of(g, *rows, n, k, row.data());
-          const double scale = rows->kind == kVector
-              ? r[n * g.components + k] * rows->coefficient[n * g.components + k] : r[n];
-          add_row(g, position, local, row.data(), k, scale, mine.data());
+        const Basis basis(g, rows->t + n * g.axes, rows->kind == kDivergence);
+        if (vector) stencil(g, basis, -1, 1.0, row.data());
+        for (int k = 0; k < c; ++k) {
+          if (!vector) row_of(g, *rows, basis, n, k, row.data());
+          const double scale = vector ? r[n * c + k] * rows->coefficient[n * c + k] : r[n];
+          add_scaled(row.data(), scale, local, near.data() + k * local);
         }
       }
+      scatter_add(g, g.position + number * local, local, near.data(), mine.data());
     }
 #pragma omp critical
     for (size_t i = 0; i < mine.size(); ++i) out[i] += mine[i];
