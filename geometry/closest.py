@@ -1,10 +1,10 @@
-"""The closest point of a surface, exactly: a k-d tree of samples proposes faces, the faces decide.
+"""The closest point of a surface, exactly: a k-d tree of its vertices proposes faces, the faces decide.
 
-Every vertex, every edge and every face carries samples of its own, so that each point of the surface has a
-sample of the same vertex, edge or face within a cover radius h. The closest point p of a surface lies on one
-of these, and x - p is orthogonal to it, hence that sample s has |x - s|^2 <= |x - p|^2 + h^2. A search for
-the nearest k samples is therefore complete, and the result exact, as soon as the k-th of them is farther than
-that; else k grows.
+The closest surface point p of x lies inside a face, inside an edge or on a vertex, and x - p is orthogonal to
+that part. One of the part's own vertices v is within the cover radius h = (longest edge) / sqrt(3) of p (Jung
+1901), hence |x - v|^2 <= |x - p|^2 + h^2. A search of the nearest k vertices has therefore met the closest
+face as soon as the k-th of them is farther away than that; else k grows. Faces longer than the others get
+further vertices, for the search only.
 """
 
 from __future__ import annotations
@@ -14,12 +14,13 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
+from .search_points import repeated, search_points
 from .surface import Surface
 
-# Samples per point at first: 6 to 16 make more points look twice, measured 20 to 60 % slower.
-FIRST_LOOK = 24
-# Near the centre of a sphere all samples are equally near: stop there, the error is below h^2 / (2 d).
-LAST_LOOK = 384
+FIRST_LOOK = 8  # vertices per point at first; measured: 4 and 12 are 10 to 20 % slower
+LAST_LOOK = (
+    1536  # where more are equally near, as at the centre of a sphere, h^2 / (2 distance) bounds the error
+)
 CHUNK = 16_384  # points at a time, so that the scratch arrays stay in the processor's cache
 
 
@@ -42,25 +43,25 @@ class Closest(NamedTuple):
 class SurfaceIndex:
     """A surface prepared for closest-point queries.
 
-    `resolution` (m) is a length of interest, such as the spacing of the grid that is asked for: faces larger
-    than it get several samples. It changes the cost, not the result. The default is the mean edge length.
+    `resolution` (m) is a length of interest, such as the spacing of the grid that is asked for: faces much
+    larger than it are given further search points. It changes the cost, not the result.
     """
 
     def __init__(self, surface: Surface, resolution: float | None = None) -> None:
         self.surface = surface
         corner = surface.vertices[surface.faces]
         self._faces = _FaceTable(corner)
-        mean = float(np.sqrt(((corner[:, 1] - corner[:, 0]) ** 2).sum(1)).mean())
-        step = 1.15 * mean if resolution is None else min(1.15 * mean, 2 * resolution)
-        self.samples, self._owner, self.cover_radius = _samples(surface, step)
-        self._tree = cKDTree(self.samples, leafsize=24)
+        longest = np.sqrt(((corner - np.roll(corner, 1, axis=1)) ** 2).sum(2)).max(1)
+        step = 1.4 * float(longest.mean())
+        search = search_points(surface, longest, step if resolution is None else min(step, 3 * resolution))
+        self.points, self.cover_radius = search.points, search.cover_radius
+        self._first, self._owners = search.first, search.owners
+        self._tree = cKDTree(search.points, leafsize=12)
 
-    def query(self, points: np.ndarray, *, band: float | None = None) -> Closest:
+    def query(self, points: np.ndarray) -> Closest:
         """The closest surface point of each of `points (n, D)`, m.
 
-        With a `band` (m), points farther than that from the surface are not searched to the end: their
-        distance may be too large by up to h^2 / (2 distance), h being `cover_radius`. Raises ValueError for
-        points that are not finite or of the wrong shape.
+        Raises ValueError for points that are not finite or of the wrong shape.
         """
         points = np.ascontiguousarray(points, dtype=np.float64)
         if points.ndim != 2 or points.shape[1] != self.surface.dimension or not np.isfinite(points).all():
@@ -70,7 +71,7 @@ class SurfaceIndex:
         weights = np.empty((len(points), self.surface.dimension))
         for start in range(0, len(points), CHUNK):
             part = slice(start, start + CHUNK)
-            face[part], weights[part] = self._search(points[part], np.inf if band is None else band)
+            face[part], weights[part] = self._search(points[part])
         return self._result(points, face, weights)
 
     def on_faces(self, points: np.ndarray, face: np.ndarray) -> Closest:
@@ -83,34 +84,38 @@ class SurfaceIndex:
         where = np.einsum("nk,nkd->nd", weights, self.surface.vertices[self.surface.faces[face]])
         return Closest(np.sqrt(((points - where) ** 2).sum(1)), face, weights)
 
-    def _search(self, points: np.ndarray, band: float) -> tuple[np.ndarray, np.ndarray]:
-        best = np.full(len(points), np.inf)
-        face = np.zeros(len(points), np.int64)
-        weights = np.zeros(points.shape)
-        todo, look = np.arange(len(points)), FIRST_LOOK
+    def _search(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        state = np.full(len(points), np.inf), np.zeros(len(points), np.int64), np.zeros(points.shape)
+        todo, look, most = np.arange(len(points)), FIRST_LOOK, len(self._first) - 1
         while len(todo):
-            look = min(look, len(self._owner))
+            look = min(look, most)
             found = self._tree.query(points[todo], k=look)
-            reach, sample = found[0].reshape(-1, look) ** 2, found[1].reshape(-1, look)
-            needed = reach <= reach[:, :1] + self.cover_radius**2
-            self._improve(points, todo, self._owner[sample], needed, (best, face, weights))
-            complete = reach[:, -1] > best[todo] + self.cover_radius**2
-            if look >= min(LAST_LOOK, len(self._owner)):
+            reach, vertex = found[0].reshape(-1, look) ** 2, found[1].reshape(-1, look)
+            self._improve(points, todo, vertex, reach <= reach[:, :1] + self.cover_radius**2, state)
+            if look >= min(LAST_LOOK, most):
                 break
-            todo = todo[~complete & (best[todo] <= band * band)]
+            todo = todo[reach[:, -1] <= state[0][todo] + self.cover_radius**2]
             look *= 4
-        return face, weights
+        return state[1], state[2]
 
-    def _improve(self, points, todo, faces, needed, state) -> None:
-        """Try candidate faces `(len(todo), k)` where needed and keep what is closer, in place."""
+    def _improve(self, points, todo, vertex, needed, state) -> None:
+        """Try the faces around vertices `(len(todo), k)` where needed and keep what is closer, in place."""
         best, face, weights = state
-        for column in range(faces.shape[1]):
-            fresh = needed[:, column] & (faces[:, column, None] != faces[:, :column]).all(1)
-            rows, candidate = todo[fresh], faces[fresh, column]
-            square, trial = self._faces.closest(points[rows], candidate)
-            closer = square < best[rows]
-            rows = rows[closer]
-            best[rows], face[rows], weights[rows] = square[closer], candidate[closer], trial[closer]
+        row, column = np.nonzero(needed)
+        around = vertex[row, column]
+        number, place = repeated(self._first[around + 1] - self._first[around])
+        # Neighbouring vertices share faces: try each face once.
+        pair = row[number] * len(self.surface.faces) + self._owners[self._first[around[number]] + place]
+        pair.sort()
+        row, candidate = np.divmod(pair[np.flatnonzero(np.diff(pair, prepend=-1))], len(self.surface.faces))
+        square, trial = self._faces.closest(points[todo[row]], candidate)
+        first = np.flatnonzero(np.diff(row, prepend=-1))
+        least = np.minimum.reduceat(square, first)
+        place = np.flatnonzero(square == np.repeat(least, np.diff(first, append=len(row))))
+        place = place[np.diff(row[place], prepend=-1) > 0]  # of equally close faces the first
+        closer = least < best[todo[row[place]]]
+        rows, place = todo[row[place[closer]]], place[closer]
+        best[rows], face[rows], weights[rows] = square[place], candidate[place], trial[place]
 
 
 class _FaceTable:
@@ -158,52 +163,3 @@ class _FaceTable:
         t = np.where(inside, t, np.where(first, 0.0, np.where(second, t1, t2)))
         value = square + s * (a * s + 2 * b * t - 2 * along) + t * (c * t - 2 * across)
         return np.maximum(value, 0), np.stack([1 - s - t, s, t], axis=1)
-
-
-def _samples(surface: Surface, step: float) -> tuple[np.ndarray, np.ndarray, float]:
-    """Points on every vertex, edge and face, a face that owns each, and their cover radius (m)."""
-    used, owner = np.unique(surface.faces, return_index=True)
-    parts = [(surface.vertices[used], owner // surface.dimension)]
-    if surface.dimension == 2:
-        ends, owners = surface.faces, np.arange(len(surface.faces))
-    else:
-        sides = np.sort(surface.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-        ends, owners = np.unique(sides, axis=0, return_index=True)
-        owners = owners // 3
-    start, along = surface.vertices[ends[:, 0]], surface.vertices[ends[:, 1]] - surface.vertices[ends[:, 0]]
-    length = np.sqrt((along * along).sum(1))
-    pieces = np.maximum(np.ceil(length / step), 1).astype(np.int64)
-    row, number = _repeated(pieces)
-    parts.append((start[row] + ((number + 0.5) / pieces[row])[:, None] * along[row], owners[row]))
-    radius = float((length / (2 * pieces)).max())
-    if surface.dimension == 3:
-        points, owners, face_radius = _face_samples(surface, step)
-        parts.append((points, owners))
-        radius = max(radius, face_radius)
-    return np.concatenate([p for p, _ in parts]), np.concatenate([o for _, o in parts]), radius
-
-
-def _face_samples(surface: Surface, step: float) -> tuple[np.ndarray, np.ndarray, float]:
-    """Centroids of the n^2 similar triangles into which each face is cut, their sides at most `step`."""
-    corner = surface.vertices[surface.faces]
-    sides = np.stack([corner[:, (k + 1) % 3] - corner[:, k] for k in range(3)], axis=1)
-    cuts = np.maximum(np.ceil(np.sqrt((sides**2).sum(2)).max(1) / step), 1).astype(np.int64)
-    points, owners = [], []
-    for n in np.unique(cuts):
-        faces = np.flatnonzero(cuts == n)
-        i, j = (index.ravel() for index in np.meshgrid(np.arange(n), np.arange(n), indexing="ij"))
-        upper = i + j >= n  # squares beyond the diagonal are folded back: triangles that point down
-        u = np.where(upper, n - i - 1 / 3, i + 1 / 3) / n
-        v = np.where(upper, n - j - 1 / 3, j + 1 / 3) / n
-        weight = np.stack([1 - u - v, u, v], axis=1)
-        points.append(np.einsum("sk,fkd->fsd", weight, corner[faces]).reshape(-1, 3))
-        owners.append(np.repeat(faces, n * n))
-    middle = corner.mean(1, keepdims=True)
-    radius = np.sqrt(((corner - middle) ** 2).sum(2)).max(1) / cuts
-    return np.concatenate(points), np.concatenate(owners), float(radius.max())
-
-
-def _repeated(count: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """For each i, count[i] rows: the i and the number of the row among them."""
-    row = np.repeat(np.arange(len(count)), count)
-    return row, np.arange(len(row)) - np.repeat(np.cumsum(count) - count, count)

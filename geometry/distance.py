@@ -27,12 +27,16 @@ class GridDistance(NamedTuple):
 def signed_distance(grid: Grid, surface: Surface, *, band: float | None = None) -> np.ndarray:
     """Distance to the surface at every node, m, float64 `shape`: positive inside the fluid, negative outside.
 
-    Exact to round-off for the given faces within `band` (m; None: everywhere). Beyond it each node tries the
-    closest face of the nearest node in the band, so that its distance is an upper bound that is too large by
-    less than a spacing squared over the distance. Raises SurfaceError for a surface that is open or inside
-    out, ValueError where the dimensions differ or the band is not positive.
+    Exact to round-off for the given faces, with a `band` (m) only within it. Beyond the band a node takes the
+    closest face of the nearest node in the band, so that its distance is too large by up to most of a
+    spacing. Raises SurfaceError for a surface that is open or inside out, ValueError where the dimensions
+    differ or the band is not positive.
 
-    Measured on one core, 5,112 faces, 143,775 nodes: band of 1.5 mm (3 spacings) 0.3 s, of 3 mm 0.6 s.
+    Measured on one core, processor time, against libraries on the same 143,775 nodes and 5,112 faces: this
+    function 0.7 s everywhere and 0.4 s with a band of 3 spacings; libigl 2.6.3 (`signed_distance`, C++) 0.35
+    s everywhere, equal to 7e-18 m; trimesh 5.2 with rtree (`proximity.signed_distance`) 93 s. libigl would
+    gain a factor of two for a compiled dependency, so that the k-d tree of SciPy stays. 132,650 faces and
+    24,375 nodes: 0.8 s.
     """
     return distance_and_closest(grid, surface, band=band).distance
 
@@ -57,7 +61,7 @@ def _near_nodes(grid: Grid, index: SurfaceIndex, band: float | None) -> np.ndarr
     """Nodes that may lie within the band, bool `shape`; None where that is not worth telling apart."""
     if band is None:
         return None
-    place = (index.samples - np.asarray(grid.origin)) / np.asarray(grid.spacing)
+    place = (index.points - np.asarray(grid.origin)) / np.asarray(grid.spacing)
     limit = np.array(grid.shape[::-1]) - 1
     # A surface outside the box leaves its marks on the box's faces, where it is closest.
     marks = tuple(np.clip(np.rint(place), 0, limit).astype(np.int64).T[::-1])

@@ -205,15 +205,7 @@ class Surface:
 
     def _ridges(self) -> tuple[np.ndarray, np.ndarray]:
         """For each edge (vertex in a plane): passes forward minus backward, and all passes."""
-        if self.dimension == 2:
-            key = self.faces.T.ravel()
-            sign = np.repeat([1, -1], len(self.faces))
-        else:
-            start, end = (self.faces[:, order].T.ravel().astype(np.int64) for order in ([0, 1, 2], [1, 2, 0]))
-            key = np.minimum(start, end) * len(self.vertices) + np.maximum(start, end)
-            sign = np.sign(end - start)  # 0 for an edge from a vertex to itself, which bounds nothing
-            key, sign = key[sign != 0], sign[sign != 0]
-        _, place = np.unique(key, return_inverse=True)
+        place, sign = ridges_of(self.faces, len(self.vertices))
         return np.bincount(place, weights=sign), np.bincount(place)
 
     def _angles(self) -> list[np.ndarray]:
@@ -225,6 +217,22 @@ class Surface:
             a, b = _unit(corner[:, (k + 1) % 3] - corner[:, k]), _unit(corner[:, (k + 2) % 3] - corner[:, k])
             result.append(np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), (a * b).sum(1)))
         return result
+
+
+def ridges_of(faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """The edges (vertices in a plane) of faces: the number of the edge, and +1 or -1 for its direction.
+
+    Both `(D * nf,)`, first all faces' first sides, then their second ones; 0 for an edge from a vertex to
+    itself, which bounds nothing.
+    """
+    if faces.shape[1] == 2:
+        key = faces.T.ravel()
+        sign = np.repeat([1, -1], len(faces))
+    else:
+        start, end = (faces[:, order].T.ravel().astype(np.int64) for order in ([0, 1, 2], [1, 2, 0]))
+        key = np.minimum(start, end) * count + np.maximum(start, end)
+        sign = np.sign(end - start)
+    return np.unique(key, return_inverse=True)[1], sign
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:
