@@ -38,8 +38,9 @@ class Benchmark:
     burn_in: int
     expected: float
     sectors: dict[str, tuple[torch.Tensor, float]]
+    experiments: int = 5
 
-    def run(self, *, experiments: int = 15, seed: int = 0, cycles: int | None = None) -> TwinResult:
+    def run(self, *, experiments: int | None = None, seed: int = 0, cycles: int | None = None) -> TwinResult:
         """The scores of independent repetitions; `cycles` shortens or lengthens the runs."""
         return run_twin(
             self.twin,
@@ -47,7 +48,7 @@ class Benchmark:
             members=self.members,
             cycles=cycles or self.cycles,
             burn_in=self.burn_in,
-            experiments=experiments,
+            experiments=experiments or self.experiments,
             seed=seed,
             sectors={name: mask for name, (mask, _) in self.sectors.items()},
         )
@@ -121,7 +122,8 @@ def benchmarks() -> list[Benchmark]:
         Benchmark("L96 LETKF N7", sakov08, ring, _ring(4, 1.04, True), 7, 1400, 400, 0.22, {}),
         Benchmark("L63 ETKF N10", sakov12, chaos, etkf(1.02, True), 10, 1064, 64, 0.60, {}),
         Benchmark("L63 ETKF N3", sakov12, chaos, etkf(1.30, False), 3, 1064, 64, 0.80, {}),
-        Benchmark("L63 stochastic N10", sakov12, chaos, enkf(1.04), 10, 1064, 64, 0.65, {}),
+        # With 10 members some runs lose the truth for a while: 15 of them make a steady median.
+        Benchmark("L63 stochastic N10", sakov12, chaos, enkf(1.04), 10, 1064, 64, 0.65, {}, 15),
         Benchmark("L63 stochastic N100", sakov12, chaos, enkf(1.01), 100, 1064, 64, 0.56, {}),
         Benchmark("advection ETKF N30", raanes15, waves, etkf(1.0, False), 30, 212, 12, 0.304, {}),
         Benchmark("advection stochastic N30", raanes15, waves, enkf(3.2), 30, 212, 12, 0.30, {}),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -12,29 +13,43 @@ from .errors import AssimilationError
 
 @dataclass(frozen=True)
 class Replacement:
-    """Member `member` was replaced; its new state was made from `donor`'s (for what only a donor can give,
-    such as particle positions)."""
+    """Member `member` was replaced; its new state was made with the help of `donor` (for what only another
+    member can give, such as particle positions)."""
 
     member: int
     donor: int
 
 
 def replace_failed(
-    ensemble: Tensor, alive: Tensor, generator: torch.Generator
+    ensemble: Tensor,
+    alive: Tensor,
+    generator: torch.Generator,
+    *,
+    fresh: Callable[[int, torch.Generator], Tensor] | None = None,
+    share: float = 0.5,
 ) -> tuple[Tensor, tuple[Replacement, ...]]:
     """The ensemble with each failed member drawn anew from the survivors' mean and covariance.
 
-    A copy of a survivor would count its information twice and cost a direction; a random combination of the
-    survivors' anomalies, `mean + sum_i z_i a_i / sqrt(S - 1)` with standard normal z, does neither. Donors
-    are the survivors in turn from a random start.
+    A copy of a survivor would count its information twice; a random combination of the survivors' anomalies,
+    `mean + sum_i z_i a_i / sqrt(S - 1)` with standard normal z, does not. But it lies in the survivors' span,
+    so that members failing again and again use up the ensemble's directions. `fresh` gives new ones: a share
+    of the variance then comes from its perturbations, scaled to the survivors' RMS spread.
 
     Args:
         ensemble: `(N, n)`.
         alive: `(N,)` bool; members that are not finite count as failed whatever it says.
+        fresh: `(count, generator) -> (count, n)` perturbations of any size, admissible in the model.
+        share: of the variance that is fresh, in [0, 1]; used with `fresh` only.
+
+    Returns:
+        The whole ensemble, and an event per failed member; donors are the survivors in turn from a random
+        start.
 
     Raises:
         AssimilationError: fewer than two survivors.
     """
+    if not 0 <= share <= 1:
+        raise AssimilationError(f"the fresh share of the variance must lie in [0, 1], got {share}")
     alive = alive & torch.isfinite(ensemble).all(-1)
     survivors, failed = torch.nonzero(alive).squeeze(-1), torch.nonzero(~alive).squeeze(-1)
     if len(survivors) < 2:
@@ -44,16 +59,23 @@ def replace_failed(
     if not len(failed):
         return ensemble, ()
     living = ensemble[survivors].double()
-    mean = living.mean(0)
-    shape = (len(failed), len(survivors))
-    draw = torch.randn(shape, generator=generator, dtype=torch.float64, device=generator.device)
-    scale = (len(survivors) - 1) ** -0.5
-    fresh = mean + scale * draw.to(living.device) @ (living - mean)
+    drawn = _combinations(living, len(failed), generator)
+    if fresh is not None:
+        new = fresh(len(failed), generator).double()
+        size = living.var(0).mean().sqrt() / new.square().mean().sqrt()
+        drawn = (1 - share) ** 0.5 * drawn + share**0.5 * size * new
     start = int(torch.randint(len(survivors), (1,), generator=generator, device=generator.device))
     events = tuple(
         Replacement(int(member), int(survivors[(start + k) % len(survivors)]))
         for k, member in enumerate(failed)
     )
     whole = ensemble.clone()
-    whole[failed] = fresh.to(ensemble.dtype)
+    whole[failed] = (living.mean(0) + drawn).to(ensemble.dtype)
     return whole, events
+
+
+def _combinations(members: Tensor, count: int, generator: torch.Generator) -> Tensor:
+    """`(count, n)` anomalies drawn from the sample covariance of `members (S, n)`."""
+    shape = (count, len(members))
+    draw = torch.randn(shape, generator=generator, dtype=torch.float64, device=generator.device)
+    return (len(members) - 1) ** -0.5 * draw.to(members.device) @ (members - members.mean(0))

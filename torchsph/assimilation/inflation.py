@@ -132,8 +132,8 @@ class Adaptive:
         spread = (self._variance.to(ratio.device) + self.drift**2).expand(ratio.shape)
         sampling = 2 / count.clamp(min=1e-30) * (self._square + used.sum(-1) / ratio) ** 2
         gain = torch.where(informed, spread / (spread + sampling), 0.0)
-        estimate = (excess / ratio).clamp(self.smallest**2 / 2, 2 * self.largest**2)
-        square = self._square + gain * (estimate - self._square)
+        # One cycle's estimate may be anything, negative too: clipping it would bias the mean upwards.
+        square = self._square + gain * (excess / ratio - self._square)
         self._square = square.clamp(self.smallest**2, self.largest**2)
         self._variance = torch.where(informed, (1 - gain) * spread, self._variance.to(ratio.device))
         return self._square.sqrt()
