@@ -52,7 +52,7 @@ template <class Real, int D, bool Plain> struct Interpolation {
 
   static void write(Sums& s, const std::int32_t* slot, Real scale, std::int64_t column, std::int64_t columns, const Moments<Real>& o) {
     const auto put = [&](V sum, Real* out, std::int64_t stride, std::int64_t component, bool scaled = true) {
-      Pass<Real, D, concentration>::put(sum, scaled ? scale : Real(1), nullptr, slot, out, int(stride), int(component));
+      sph::put<Real>(sum, scaled ? scale : Real(1), nullptr, slot, out + component, int(stride));
     };
     if constexpr (Plain) {
       put(s.count, o.count, 1, 0, false);

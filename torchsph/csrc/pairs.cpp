@@ -35,7 +35,7 @@ constexpr bool compiled(std::uint32_t t) {
   if (t > 255) return t == shepard || t == renormalisation || t == laplacian;
   if ((t & tensile) && !(t & pressure)) return false;
   if (!rates || !forces) return t != 0;
-  return sizeof(Real) == 4 && register_bytes > 16 && (t & continuity) && (t & pressure) && !(t & tensile);
+  return sizeof(Real) == 4 && register_bytes > 16 && (t & continuity) && (t & pressure) && !(t & (concentration | tensile));
 }
 
 using Run = void (*)(const Lists<Real>&, const Rows<Real>&, const KernelChoice&, const Coefficients*, const Outputs<Real>&);

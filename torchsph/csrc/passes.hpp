@@ -21,6 +21,17 @@ struct KernelChoice {
   double support, sigma;
 };
 
+// Spread a register of sums over the particles of its slots. Not inlined: it runs once per cluster and sum, and copies of
+// it in every pass would double the time to compile.
+template <class Real>
+__attribute__((noinline)) void put(typename Lanes<Real>::Vector sum, Real scale, const Real* factor, const std::int32_t* slot,
+                                   Real* out, int stride) {
+  Real lane[cluster_size];
+  Lanes<Real>::store_own(lane, sum);
+  for (int l = 0; l < Lanes<Real>::own; ++l)
+    if (slot[l] >= 0) out[std::int64_t(slot[l]) * stride] = (factor ? factor[l] : Real(1)) * scale * lane[l];
+}
+
 template <class Real, int D, std::uint32_t T> struct Pass {
   using L = Lanes<Real>;
   using V = typename L::Vector;
@@ -108,32 +119,25 @@ template <class Real, int D, std::uint32_t T> struct Pass {
     }
   }
 
-  static SPH_INLINE void put(V sum, Real scale, const Real* factor, const std::int32_t* slot, Real* out, int stride, int component) {
-    Real lane[cluster_size];
-    L::store_own(lane, sum);
-    for (int l = 0; l < L::own; ++l)
-      if (slot[l] >= 0) out[std::int64_t(slot[l]) * stride + component] = (factor ? factor[l] : Real(1)) * scale * lane[l];
-  }
-
   static SPH_INLINE void write(const Sums& s, const std::int32_t* slot, const Real* factor, Real per_value, Real per_slope,
                                const Outputs<Real>& o) {
-    if constexpr (has(continuity)) put(s.divergence, per_slope, nullptr, slot, o.divergence, 1, 0);
-    if constexpr (has(diffusion)) put(s.diffusion, 2 * per_slope, nullptr, slot, o.diffusion, 1, 0);
+    if constexpr (has(continuity)) put<Real>(s.divergence, per_slope, nullptr, slot, o.divergence, 1);
+    if constexpr (has(diffusion)) put<Real>(s.diffusion, 2 * per_slope, nullptr, slot, o.diffusion, 1);
     if constexpr (has(shepard)) {
-      put(s.shepard_volume, per_value, nullptr, slot, o.shepard_volume, 1, 0);
-      put(s.shepard_mass, per_value, nullptr, slot, o.shepard_mass, 1, 0);
+      put<Real>(s.shepard_volume, per_value, nullptr, slot, o.shepard_volume, 1);
+      put<Real>(s.shepard_mass, per_value, nullptr, slot, o.shepard_mass, 1);
     }
     if constexpr (has(laplacian)) {
-      put(s.laplacian, 2 * per_slope, factor, slot, o.laplacian, 1, 0);
-      put(s.diagonal, 2 * per_slope, factor, slot, o.diagonal, 1, 0);
+      put<Real>(s.laplacian, 2 * per_slope, factor, slot, o.laplacian, 1);
+      put<Real>(s.diagonal, 2 * per_slope, factor, slot, o.diagonal, 1);
     }
     for (int d = 0; d < D; ++d) {
-      if constexpr (has(concentration)) put(s.concentration[d], per_slope, nullptr, slot, o.concentration, D, d);
-      if constexpr (has(xsph)) put(s.xsph[d], 2 * per_value, factor, slot, o.xsph, D, d);
-      if constexpr (has(pressure | artificial | laminar)) put(s.acceleration[d], per_slope, factor, slot, o.acceleration, D, d);
+      if constexpr (has(concentration)) put<Real>(s.concentration[d], per_slope, nullptr, slot, o.concentration + d, D);
+      if constexpr (has(xsph)) put<Real>(s.xsph[d], 2 * per_value, factor, slot, o.xsph + d, D);
+      if constexpr (has(pressure | artificial | laminar)) put<Real>(s.acceleration[d], per_slope, factor, slot, o.acceleration + d, D);
     }
     if constexpr (has(renormalisation))
-      for (int d = 0; d < D * D; ++d) put(s.renormalisation[d], per_slope, nullptr, slot, o.renormalisation, D * D, d);
+      for (int d = 0; d < D * D; ++d) put<Real>(s.renormalisation[d], per_slope, nullptr, slot, o.renormalisation + d, D * D);
   }
 
   static void run(const Lists<Real>& lists, const Rows<Real>& rows, const KernelChoice& choice, const Coefficients* members,

@@ -26,7 +26,7 @@ SPH_INLINE Smoothing<V> smoothing(std::int32_t kernel, V square /* q^2 */, Real 
     const V e = square < support * support ? exponential(Real(-0.5) * square) : zero;
     return {e, -e};
   }
-  const V q = square_root(square);
+  const V q = smaller(square_root(square), zero + support);  // powers of a stray particle's distance would overflow
   switch (kernel) {
     case wendland_c4: {
       const V t = positive_part(1 - Real(0.5) * q), t2 = t * t, t5 = t2 * t2 * t;

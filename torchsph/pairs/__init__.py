@@ -5,6 +5,14 @@ from .reference import ReferenceBackend
 from .registry import available_backends, backend
 
 __all__ = [
-    "Backend", "Moments", "MomentumTerms", "PairState", "RateTerms", "Rates", "ReferenceBackend", "Support",
-    "available_backends", "backend",
+    "Backend",
+    "Moments",
+    "MomentumTerms",
+    "PairState",
+    "RateTerms",
+    "Rates",
+    "ReferenceBackend",
+    "Support",
+    "available_backends",
+    "backend",
 ]

@@ -1,6 +1,7 @@
 """Compile the pair kernels: ``python -m torchsph.pairs.build`` puts them beside the package's sources.
 
-This file uses only the standard library and is also run by path, from the PEP 517 backend, where torch is not installed.
+This file uses only the standard library and is also run by path, from the PEP 517 backend, where there is no
+torch.
 """
 
 from __future__ import annotations
@@ -20,13 +21,30 @@ LIBRARIES = Path(__file__).resolve().parent.parent / "_native"
 
 # -ffast-math as a whole would reorder sums and, at the link, set flush-to-zero for the whole process
 FLAGS = (
-    "-std=c++17", "-O3", "-fPIC", "-fopenmp", "-fvisibility=hidden", "-Wall", "-Wextra",
-    "-fno-math-errno", "-fno-trapping-math", "-fno-signed-zeros", "-ffinite-math-only",
+    "-std=c++17",
+    "-O3",
+    "-fPIC",
+    "-fopenmp",
+    "-fvisibility=hidden",
+    "-Wall",
+    "-Wextra",
+    "-fno-math-errno",
+    "-fno-trapping-math",
+    "-fno-signed-zeros",
+    "-ffinite-math-only",
 )
 X86 = {
     "baseline": (),
     "avx2": ("-mavx2", "-mfma"),
-    "avx512": ("-mavx512f", "-mavx512dq", "-mavx512vl", "-mavx512bw", "-mavx2", "-mfma", "-mprefer-vector-width=512"),
+    "avx512": (
+        "-mavx512f",
+        "-mavx512dq",
+        "-mavx512vl",
+        "-mavx512bw",
+        "-mavx2",
+        "-mfma",
+        "-mprefer-vector-width=512",
+    ),
 }
 
 
@@ -81,12 +99,18 @@ def build(out_dir: str | Path, source: str | Path = SOURCE, jobs: int | None = N
         return []
     source, out_dir = Path(source), Path(out_dir)
     if not (source / "pairs.cpp").is_file():
-        raise FileNotFoundError(f"the pair kernels' source {source / 'pairs.cpp'} is missing; reinstall from a complete tree")
+        raise FileNotFoundError(
+            f"the pair kernels' source {source / 'pairs.cpp'} is missing; reinstall from a complete tree"
+        )
     out_dir.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix="torchsph-") as scratch, ThreadPoolExecutor(jobs or os.cpu_count()) as pool:
+    with (
+        tempfile.TemporaryDirectory(prefix="torchsph-") as scratch,
+        ThreadPoolExecutor(jobs or os.cpu_count()) as pool,
+    ):
         tasks = {
             (isa, part.name): pool.submit(_compile, command, source, Path(scratch), isa, part)
-            for part in _OBJECTS for isa in instruction_sets()
+            for part in _OBJECTS
+            for isa in instruction_sets()
         }
         return [
             _link(command, [tasks[isa, part.name].result() for part in _OBJECTS], out_dir / library_name(isa))
@@ -119,8 +143,10 @@ def main() -> int:
     """Build into the source tree and say what was made."""
     made = build(LIBRARIES)
     if not made:
-        print("no C++ compiler found (set CXX, or install g++ or clang++); the reference backend works without",
-              file=sys.stderr)
+        print(
+            "no C++ compiler found (set CXX, or install g++ or clang++); the reference backend works without",
+            file=sys.stderr,
+        )
         return 1
     for path in made:
         print(f"{path} ({path.stat().st_size / 1024:.0f} KiB)")

@@ -11,7 +11,15 @@ from torch import Tensor
 from ..smoothing import KERNELS, SmoothingKernel
 from . import cpu_operators as operators
 from .interface import (
-    PRESSURE_FORMS, Backend, Moments, MomentumTerms, PairState, Rates, RateTerms, Support, check_search,
+    PRESSURE_FORMS,
+    Backend,
+    Moments,
+    MomentumTerms,
+    PairState,
+    Rates,
+    RateTerms,
+    Support,
+    check_search,
 )
 from .native import library
 
@@ -36,7 +44,7 @@ class ClusterPairs:
 
     @property
     def order(self) -> Tensor:
-        """Particle indices (N,) in the order of the clusters: a caller that keeps its arrays so packs them faster."""
+        """Particle indices (N,) in the order of the clusters; arrays kept in this order are packed faster."""
         slot = self.lists[0]
         return slot[slot >= 0].to(torch.int64)
 
@@ -58,13 +66,20 @@ class CpuBackend(Backend):
         self.instruction_set = library().instruction_set
 
     def search(
-        self, position: Tensor, member: Tensor, radius: float, *, margin: float = 0.0,
+        self,
+        position: Tensor,
+        member: Tensor,
+        radius: float,
+        *,
+        margin: float = 0.0,
         period: Tensor | None = None,
     ) -> ClusterPairs:
         _check_reals(position)
         length = _lengths(period, position.shape[1])
         check_search(None, radius + margin, period)
-        lists = operators.cluster_lists(position.detach().contiguous(), member.contiguous(), radius + margin, length)
+        lists = operators.cluster_lists(
+            position.detach().contiguous(), member.contiguous(), radius + margin, length
+        )
         return ClusterPairs(lists, length, position.shape[0])
 
     def rates(self, pairs: ClusterPairs, state: PairState, support: Support, terms: RateTerms) -> Rates:
@@ -72,28 +87,47 @@ class CpuBackend(Backend):
         run.rates(terms)
         return run.result()
 
-    def momentum(self, pairs: ClusterPairs, state: PairState, support: Support, terms: MomentumTerms) -> Tensor:
+    def momentum(
+        self, pairs: ClusterPairs, state: PairState, support: Support, terms: MomentumTerms
+    ) -> Tensor:
         run = _Passes(pairs, state, support)
         run.momentum(terms)
         return run.sums["acceleration"]
 
     def right_hand_side(
-        self, pairs: ClusterPairs, state: PairState, support: Support, rates: RateTerms, momentum: MomentumTerms
+        self,
+        pairs: ClusterPairs,
+        state: PairState,
+        support: Support,
+        rates: RateTerms,
+        momentum: MomentumTerms,
     ) -> tuple[Rates, Tensor]:
         run = _Passes(pairs, state, support)
         run.together(rates, momentum)
         return run.result(), run.sums["acceleration"]
 
     def laplacian(
-        self, pairs: ClusterPairs, state: PairState, support: Support, field: Tensor, active: Tensor | None = None
+        self,
+        pairs: ClusterPairs,
+        state: PairState,
+        support: Support,
+        field: Tensor,
+        active: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
         run = _Passes(pairs, state, support)
         run.one(operators.LAPLACIAN, _BY_VOLUME, field=field, active=active)
         return run.sums["laplacian"], run.sums["diagonal"]
 
     def interpolate(
-        self, position: Tensor, member: Tensor, fields: Tensor, support: Support, query: Tensor,
-        query_member: Tensor, *, period: Tensor | None = None,
+        self,
+        position: Tensor,
+        member: Tensor,
+        fields: Tensor,
+        support: Support,
+        query: Tensor,
+        query_member: Tensor,
+        *,
+        period: Tensor | None = None,
     ) -> Moments:
         _check_reals(position, fields, query)
         check_search(None, support.radius, period)
@@ -101,9 +135,11 @@ class CpuBackend(Backend):
         kind, numbers = _kernel_choice(support)
         lengths = torch.as_tensor(support.length, dtype=torch.float64).expand(members).contiguous()
         tensors = (t.detach().contiguous() for t in (position, member, fields, query, query_member))
-        return Moments(*operators.interpolation_moments(
-            *tensors, support.radius, _lengths(period, position.shape[1]), kind, numbers, lengths
-        ))
+        return Moments(
+            *operators.interpolation_moments(
+                *tensors, support.radius, _lengths(period, position.shape[1]), kind, numbers, lengths
+            )
+        )
 
 
 class _Passes:
@@ -112,7 +148,10 @@ class _Passes:
     def __init__(self, pairs: ClusterPairs, state: PairState, support: Support) -> None:
         _check_reals(state.position, state.velocity, state.mass, state.deviation)
         if state.position.shape[0] != pairs.count:
-            raise ValueError(f"the pairs are of {pairs.count} particles and the state of {state.position.shape[0]}: search anew")
+            raise ValueError(
+                f"the pairs are of {pairs.count} particles and the state of {state.position.shape[0]}: "
+                "search anew"
+            )
         self.pairs, self.state, self.support = pairs, state, support
         self.arrays = [t.contiguous() for t in (state.position, state.velocity, state.mass, state.deviation)]
         self.sums: dict[str, Tensor] = {}
@@ -122,8 +161,10 @@ class _Passes:
 
     def rates(self, terms: RateTerms) -> None:
         by_volume = (
-            operators.DIFFUSION * terms.diffusion | operators.CONCENTRATION * terms.concentration
-            | operators.XSPH * terms.xsph | operators.CONTINUITY * (terms.continuity == "volume")
+            operators.DIFFUSION * terms.diffusion
+            | operators.CONCENTRATION * terms.concentration
+            | operators.XSPH * terms.xsph
+            | operators.CONTINUITY * (terms.continuity == "volume")
         )
         if terms.continuity == "mass":
             apart = terms.diffusion or terms.concentration  # these are weighted by volume
@@ -144,16 +185,13 @@ class _Passes:
         """Rates and forces in one loop where that is compiled, else one after the other."""
         flags, weight = _forces(momentum)
         same_weight = rates.continuity == ("volume" if weight == _BY_VOLUME else "mass")
-        by_volume_only = rates.diffusion or rates.concentration
         fits = flags & operators.PRESSURE and not flags & operators.TENSILE and same_weight
-        if not fits or (by_volume_only and weight == _BY_MASS) or not _fuses(self.state.position):
+        fits = fits and not rates.concentration and not (rates.diffusion and weight == _BY_MASS)
+        if not fits or not _fuses(self.state.position):
             self.rates(rates)
             self.momentum(momentum)
             return
-        flags |= (
-            operators.CONTINUITY | operators.DIFFUSION * rates.diffusion
-            | operators.CONCENTRATION * rates.concentration | operators.XSPH * rates.xsph
-        )
+        flags |= operators.CONTINUITY | operators.DIFFUSION * rates.diffusion | operators.XSPH * rates.xsph
         self.one(flags, weight, momentum)
         self._others(rates)
 
@@ -164,17 +202,31 @@ class _Passes:
             self.one(operators.RENORMALISATION, _BY_VOLUME)
 
     def one(
-        self, terms: int, weight: int, momentum: MomentumTerms | None = None, field: Tensor | None = None,
+        self,
+        terms: int,
+        weight: int,
+        momentum: MomentumTerms | None = None,
+        field: Tensor | None = None,
         active: Tensor | None = None,
     ) -> None:
         kind, numbers = _kernel_choice(self.support)
-        form = PRESSURE_FORMS.index(momentum.pressure) if momentum is not None and momentum.pressure is not None else 0
+        form = (
+            PRESSURE_FORMS.index(momentum.pressure)
+            if momentum is not None and momentum.pressure is not None
+            else 0
+        )
         pressure = self.state.pressure.contiguous() if terms & operators.PRESSURE else None
         if pressure is not None or field is not None:
             _check_reals(self.state.position, *(t for t in (pressure, field) if t is not None))
         outputs = operators.pair_pass(
-            self.pairs.lists, self.pairs.period, [terms, weight, form, kind], numbers, self._coefficients(momentum),
-            *self.arrays, pressure, None if field is None else field.contiguous(),
+            self.pairs.lists,
+            self.pairs.period,
+            [terms, weight, form, kind],
+            numbers,
+            self._coefficients(momentum),
+            *self.arrays,
+            pressure,
+            None if field is None else field.contiguous(),
             None if active is None else active.contiguous(),
         )
         self.sums.update(zip(operators.output_names(terms), outputs, strict=True))
@@ -199,8 +251,10 @@ class _Passes:
 
 def _forces(terms: MomentumTerms) -> tuple[int, int]:
     flags = (
-        operators.PRESSURE * (terms.pressure is not None) | operators.ARTIFICIAL * (terms.artificial is not None)
-        | operators.LAMINAR * (terms.laminar is not None) | operators.TENSILE * (terms.tensile is not None)
+        operators.PRESSURE * (terms.pressure is not None)
+        | operators.ARTIFICIAL * (terms.artificial is not None)
+        | operators.LAMINAR * (terms.laminar is not None)
+        | operators.TENSILE * (terms.tensile is not None)
     )
     return flags, _BY_MASS if terms.pressure in (None, "symmetric") else _BY_VOLUME
 
@@ -215,15 +269,20 @@ def _kernel_choice(support: Support) -> tuple[int, Sequence[float]]:
     known = family == "gaussian" or KERNELS.get(kernel.name) is kernel
     if family not in _KERNELS or not known:
         raise ValueError(
-            f"the cpu backend has no kernel '{kernel.name}' compiled in; use backend='reference', or one of {', '.join(_KERNELS)}"
+            f"the cpu backend has no kernel '{kernel.name}' compiled in; use backend='reference', or one of "
+            f"{', '.join(_KERNELS)}"
         )
     return _KERNELS.index(family), (kernel.support, kernel.normalisation[support.dimension])
 
 
 def _shape_at(support: Support, distance: float) -> float | Tensor:
-    ratio = torch.as_tensor(distance, dtype=torch.float64) / torch.as_tensor(support.length, dtype=torch.float64)
+    ratio = torch.as_tensor(distance, dtype=torch.float64) / torch.as_tensor(
+        support.length, dtype=torch.float64
+    )
     if bool((ratio >= support.kernel.support).any()):
-        raise ValueError(f"tensile_distance {distance:g} lies outside the kernel's support; give the particle spacing")
+        raise ValueError(
+            f"tensile_distance {distance:g} lies outside the kernel's support; give the particle spacing"
+        )
     return support.kernel.shape(ratio)
 
 
@@ -235,8 +294,12 @@ def _check_reals(*tensors: Tensor) -> None:
     kind = tensors[0].dtype
     for tensor in tensors:
         if tensor.device.type != "cpu":
-            raise ValueError(f"the cpu backend works on CPU tensors, got one on '{tensor.device}'; use backend='auto'")
+            raise ValueError(
+                f"the cpu backend works on CPU tensors, got one on '{tensor.device}'; use backend='auto'"
+            )
         if tensor.dtype != kind or kind not in (torch.float32, torch.float64):
-            raise TypeError(f"the cpu backend wants all arrays in float32 or all in float64, got {kind} and {tensor.dtype}")
+            raise TypeError(
+                f"the cpu backend wants all arrays in float32 or all in float64, got {kind}, {tensor.dtype}"
+            )
         if tensor.requires_grad:
             raise ValueError("the cpu backend is not differentiable; use backend='reference' for gradients")

@@ -1,7 +1,7 @@
 """The C++ kernels as torch custom operators: tensors in, new tensors out, with shapes that torch can ask for.
 
-An operator allocates its results and hands addresses to the plain C interface of ``csrc/interface.h``; nothing here
-knows what the sums mean.
+An operator allocates its results and hands addresses to the plain C interface of ``csrc/interface.h``;
+nothing here knows what the sums mean.
 """
 
 from __future__ import annotations
@@ -21,16 +21,20 @@ PRESSURE, ARTIFICIAL, LAMINAR, TENSILE = 16, 32, 64, 128
 SHEPARD, RENORMALISATION, LAPLACIAN = 256, 512, 1024
 _SCALAR, _VECTOR, _MATRIX = 0, 1, 2
 _OUTPUTS: tuple[tuple[int, str, int], ...] = (
-    (CONTINUITY, "divergence", _SCALAR), (DIFFUSION, "diffusion", _SCALAR),
-    (CONCENTRATION, "concentration", _VECTOR), (XSPH, "xsph", _VECTOR),
+    (CONTINUITY, "divergence", _SCALAR),
+    (DIFFUSION, "diffusion", _SCALAR),
+    (CONCENTRATION, "concentration", _VECTOR),
+    (XSPH, "xsph", _VECTOR),
     (PRESSURE | ARTIFICIAL | LAMINAR, "acceleration", _VECTOR),
-    (SHEPARD, "shepard_volume", _SCALAR), (SHEPARD, "shepard_mass", _SCALAR),
+    (SHEPARD, "shepard_volume", _SCALAR),
+    (SHEPARD, "shepard_mass", _SCALAR),
     (RENORMALISATION, "renormalisation", _MATRIX),
-    (LAPLACIAN, "laplacian", _SCALAR), (LAPLACIAN, "diagonal", _SCALAR),
+    (LAPLACIAN, "laplacian", _SCALAR),
+    (LAPLACIAN, "diagonal", _SCALAR),
 )
 _REALS = {torch.float32: "f32", torch.float64: "f64"}
 
-# entries per cluster of the last search: the next one allocates a little more, and repeats if that is too little
+# entries per cluster of the last search: the next one allocates a little more, and repeats if it must
 _entries_per_cluster = 200.0
 
 
@@ -41,9 +45,7 @@ def output_names(terms: int) -> list[str]:
 
 def _allocate(terms: int, position: Tensor) -> list[Tensor]:
     count, dimension = position.shape
-    return [
-        position.new_empty((count, *(dimension,) * rank)) for flag, _, rank in _OUTPUTS if terms & flag
-    ]
+    return [position.new_empty((count, *(dimension,) * rank)) for flag, _, rank in _OUTPUTS if terms & flag]
 
 
 def _address(tensor: Tensor | None) -> int | None:
@@ -59,7 +61,8 @@ def cluster_lists(position: Tensor, member: Tensor, radius: float, period: Seque
     """Sort particles into clusters and list their neighbours.
 
     Returns:
-        slot (S,), owner (C,), entries (E,) int32; offset (C,) int64; home (S, D), (0, D) without a periodic axis.
+        slot (S,), owner (C,), entries (E,) int32; offset (C,) int64; home (S, D), or (0, D) where no
+        axis is periodic.
 
     Raises:
         ValueError: a position is not finite, or a member index is negative.
@@ -67,15 +70,20 @@ def cluster_lists(position: Tensor, member: Tensor, radius: float, period: Seque
     global _entries_per_cluster
     reals, code = _REALS[position.dtype], library()
     given = SearchArguments(
-        position.shape[0], position.data_ptr(), member.data_ptr(), radius, _period(period), position.shape[1],
+        position.shape[0],
+        position.data_ptr(),
+        member.data_ptr(),
+        radius,
+        _period(period),
+        position.shape[1],
         torch.get_num_threads(),
     )
     sizes = Sizes()
     code.function("sort", reals)(ctypes.byref(given), ctypes.byref(sizes))
     if sizes.unusable:
         raise ValueError(
-            f"{sizes.unusable} particle positions are not finite (or members are negative); freeze or remove them "
-            "before the search"
+            f"{sizes.unusable} particle positions are not finite (or members are negative); freeze or remove "
+            "them before the search"
         )
     slots, clusters = CLUSTER * sizes.clusters, sizes.clusters
     periodic = any(length != float("inf") for length in period)
@@ -87,7 +95,9 @@ def cluster_lists(position: Tensor, member: Tensor, radius: float, period: Seque
     while needed > capacity:
         capacity = needed
         entries = torch.empty(capacity, dtype=torch.int32)
-        lists = ListArguments(*(t.data_ptr() for t in (slot, owner, offset, entries)), home.data_ptr() if periodic else None)
+        lists = ListArguments(
+            *(t.data_ptr() for t in (slot, owner, offset, entries)), home.data_ptr() if periodic else None
+        )
         needed = code.function("list", reals)(ctypes.byref(given), capacity, ctypes.byref(lists))
     _entries_per_cluster = needed / max(clusters, 1)
     return [slot, owner, entries, offset, home]
@@ -105,9 +115,18 @@ def _(position: Tensor, member: Tensor, radius: float, period: Sequence[float]) 
 
 @torch.library.custom_op("torchsph::pair_pass", mutates_args=(), device_types="cpu")
 def pair_pass(
-    lists: Sequence[Tensor], period: Sequence[float], choice: Sequence[int], kernel: Sequence[float],
-    coefficients: Tensor, position: Tensor, velocity: Tensor, mass: Tensor, deviation: Tensor,
-    pressure: Tensor | None, field: Tensor | None, active: Tensor | None,
+    lists: Sequence[Tensor],
+    period: Sequence[float],
+    choice: Sequence[int],
+    kernel: Sequence[float],
+    coefficients: Tensor,
+    position: Tensor,
+    velocity: Tensor,
+    mass: Tensor,
+    deviation: Tensor,
+    pressure: Tensor | None,
+    field: Tensor | None,
+    active: Tensor | None,
 ) -> list[Tensor]:
     """One pass over the cluster lists.
 
@@ -123,11 +142,30 @@ def pair_pass(
     terms, weight, form, kind = choice
     outputs = _allocate(terms, position)
     given = PassArguments(
-        position.shape[1], torch.get_num_threads(), terms, weight, form, kind, kernel[0], kernel[1],
-        position.shape[0], owner.shape[0], slot.data_ptr(), owner.data_ptr(), entries.data_ptr(), offset.data_ptr(),
-        home.data_ptr() if home.numel() else None, _period(period), coefficients.data_ptr(),
-        position.data_ptr(), velocity.data_ptr(), mass.data_ptr(), deviation.data_ptr(),
-        _address(pressure), _address(field), _address(active),
+        position.shape[1],
+        torch.get_num_threads(),
+        terms,
+        weight,
+        form,
+        kind,
+        kernel[0],
+        kernel[1],
+        position.shape[0],
+        owner.shape[0],
+        slot.data_ptr(),
+        owner.data_ptr(),
+        entries.data_ptr(),
+        offset.data_ptr(),
+        home.data_ptr() if home.numel() else None,
+        _period(period),
+        coefficients.data_ptr(),
+        position.data_ptr(),
+        velocity.data_ptr(),
+        mass.data_ptr(),
+        deviation.data_ptr(),
+        _address(pressure),
+        _address(field),
+        _address(active),
     )
     for name, output in zip(output_names(terms), outputs, strict=True):
         setattr(given, name, output.data_ptr())
@@ -138,17 +176,34 @@ def pair_pass(
 
 @pair_pass.register_fake
 def _(
-    lists: Sequence[Tensor], period: Sequence[float], choice: Sequence[int], kernel: Sequence[float],
-    coefficients: Tensor, position: Tensor, velocity: Tensor, mass: Tensor, deviation: Tensor,
-    pressure: Tensor | None, field: Tensor | None, active: Tensor | None,
+    lists: Sequence[Tensor],
+    period: Sequence[float],
+    choice: Sequence[int],
+    kernel: Sequence[float],
+    coefficients: Tensor,
+    position: Tensor,
+    velocity: Tensor,
+    mass: Tensor,
+    deviation: Tensor,
+    pressure: Tensor | None,
+    field: Tensor | None,
+    active: Tensor | None,
 ) -> list[Tensor]:
     return _allocate(choice[0], position)
 
 
 @torch.library.custom_op("torchsph::interpolation_moments", mutates_args=(), device_types="cpu")
 def interpolation_moments(
-    position: Tensor, member: Tensor, fields: Tensor, query: Tensor, query_member: Tensor, radius: float,
-    period: Sequence[float], kind: int, kernel: Sequence[float], lengths: Tensor,
+    position: Tensor,
+    member: Tensor,
+    fields: Tensor,
+    query: Tensor,
+    query_member: Tensor,
+    radius: float,
+    period: Sequence[float],
+    kind: int,
+    kernel: Sequence[float],
+    lengths: Tensor,
 ) -> list[Tensor]:
     """Moments of particles around queries; shapes as in ``Moments``, ``lengths`` (members,) float64.
 
@@ -156,24 +211,48 @@ def interpolation_moments(
         ValueError: a position is not finite, or a member index is negative.
     """
     given = SearchArguments(
-        position.shape[0], position.data_ptr(), member.data_ptr(), radius, _period(period), position.shape[1],
+        position.shape[0],
+        position.data_ptr(),
+        member.data_ptr(),
+        radius,
+        _period(period),
+        position.shape[1],
         torch.get_num_threads(),
     )
     outputs = _allocate_moments(fields, query)
     arguments = InterpolationArguments(
-        given, fields.data_ptr(), fields.shape[1], query.shape[0], query.data_ptr(), query_member.data_ptr(), kind,
-        kernel[0], kernel[1], lengths.data_ptr(), *(output.data_ptr() for output in outputs),
+        given,
+        fields.data_ptr(),
+        fields.shape[1],
+        query.shape[0],
+        query.data_ptr(),
+        query_member.data_ptr(),
+        kind,
+        kernel[0],
+        kernel[1],
+        lengths.data_ptr(),
+        *(output.data_ptr() for output in outputs),
     )
     unusable = library().function("interpolate", _REALS[position.dtype])(ctypes.byref(arguments))
     if unusable:
-        raise ValueError(f"{unusable} particle or query positions are not finite, or their member does not exist")
+        raise ValueError(
+            f"{unusable} particle or query positions are not finite, or their member does not exist"
+        )
     return outputs
 
 
 @interpolation_moments.register_fake
 def _(
-    position: Tensor, member: Tensor, fields: Tensor, query: Tensor, query_member: Tensor, radius: float,
-    period: Sequence[float], kind: int, kernel: Sequence[float], lengths: Tensor,
+    position: Tensor,
+    member: Tensor,
+    fields: Tensor,
+    query: Tensor,
+    query_member: Tensor,
+    radius: float,
+    period: Sequence[float],
+    kind: int,
+    kernel: Sequence[float],
+    lengths: Tensor,
 ) -> list[Tensor]:
     return _allocate_moments(fields, query)
 

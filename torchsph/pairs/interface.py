@@ -1,10 +1,10 @@
 """The one interface to the pair sums: what a backend reads, which sums it can be asked for, what it returns.
 
-Quantities are in any consistent units; the simulator calls with lengths in particle spacings and velocities in its
-reference speed.  All particles of all members stand in one flat array, ordered as the caller likes, and ``member``
-says to which member each belongs: particles of different members never interact.  Density is carried as its relative
-deviation  d = (rho - rho0) / rho0,  because float32 would lose it in rho; pressure is p / rho0 and mass is m / rho0, so
-that  m / (1 + d)  is a volume.
+Quantities are in any consistent units; the simulator calls with lengths in particle spacings and velocities
+in its reference speed.  All particles of all members stand in one flat array, ordered as the caller likes,
+and ``member`` says to which member each belongs: particles of different members never interact.  Density is
+carried as its relative deviation  d = (rho - rho0) / rho0,  because float32 would lose it in rho; pressure
+is p / rho0 and mass is m / rho0, so that  m / (1 + d)  is a volume.
 """
 
 from __future__ import annotations
@@ -111,7 +111,7 @@ class MomentumTerms:
         pressure: "symmetric": -sum m_b (p_a/rho_a^2 + p_b/rho_b^2) grad W (2.23);
             "sum": -sum m_b (p_a + p_b)/(rho_a rho_b) grad W (Colagrossi & Landrini 2003 eq. 8);
             "switched": as "sum" with p_a replaced by |p_a| (Sun et al. 2017 eq. 11: tensile control);
-            "difference": as "sum" with -p_a (exact for constant pressure, not conservative); None: no pressure.
+            "difference": as "sum" with -p_a (exact for constant pressure, not conservative); None: none.
         artificial: alpha * c in 2.29 (speed); None switches the artificial viscosity off.
         laminar: kinematic viscosity nu of Morris, Fox & Zhu 1997 eq. 22; None switches it off.
         tensile: coefficient R of Monaghan 2000 (0.2 there, for the symmetric form); None switches it off.
@@ -128,12 +128,14 @@ class MomentumTerms:
         if self.pressure is not None and self.pressure not in PRESSURE_FORMS:
             raise ValueError(f"pressure must be one of {PRESSURE_FORMS} or None, got '{self.pressure}'")
         if self.tensile is not None and self.pressure != "symmetric":
-            raise ValueError(f"the tensile term belongs to the symmetric pressure form, got pressure '{self.pressure}'")
+            raise ValueError(
+                f"the tensile term belongs to the symmetric pressure form, got pressure '{self.pressure}'"
+            )
 
 
 @dataclass(frozen=True)
 class Moments:
-    """Sums over the particles b around query points, with the offset s = x_b - x_query and the weight W(|s|, h).
+    """Sums over the particles b around query points, with offset s = x_b - x_query and weight W(|s|, h).
 
     Attributes:
         count: (M,) number of particles with a positive weight, in the dtype of the others.
@@ -153,19 +155,27 @@ class Moments:
 
 
 class Backend(ABC):
-    """A way to evaluate the pair sums.  ``pairs`` is whatever ``search`` returned; it is opaque to the caller."""
+    """A way to evaluate the pair sums.  ``pairs`` is whatever ``search`` returned, opaque to the caller."""
 
     name: str
 
     @abstractmethod
     def search(
-        self, position: Tensor, member: Tensor, radius: float, *, margin: float = 0.0,
+        self,
+        position: Tensor,
+        member: Tensor,
+        radius: float,
+        *,
+        margin: float = 0.0,
         period: Tensor | None = None,
     ) -> Any:
         """Find the pairs closer than ``radius + margin``.
 
-        The result serves until a particle has moved by ``margin / 2``. ``period`` (D,) gives the period of each axis
-        (inf: not periodic). Raises ValueError for a non-finite position or a period shorter than three radii.
+        The result serves until a particle has moved by ``margin / 2``. ``period`` (D,) gives the period of
+        each axis (inf: not periodic).
+
+        Raises:
+            ValueError: a position is not finite, or a period is shorter than three radii.
         """
 
     @abstractmethod
@@ -179,7 +189,7 @@ class Backend(ABC):
     def right_hand_side(
         self, pairs: Any, state: PairState, support: Support, rates: RateTerms, momentum: MomentumTerms
     ) -> tuple[Rates, Tensor]:
-        """Both passes at one state, where the pressure does not wait for the rates; a backend may share their loop."""
+        """Both passes at one state, where pressure does not wait for rates; a backend may share the loop."""
         return self.rates(pairs, state, support, rates), self.momentum(pairs, state, support, momentum)
 
     @abstractmethod
@@ -193,8 +203,15 @@ class Backend(ABC):
 
     @abstractmethod
     def interpolate(
-        self, position: Tensor, member: Tensor, fields: Tensor, support: Support, query: Tensor,
-        query_member: Tensor, *, period: Tensor | None = None,
+        self,
+        position: Tensor,
+        member: Tensor,
+        fields: Tensor,
+        support: Support,
+        query: Tensor,
+        query_member: Tensor,
+        *,
+        period: Tensor | None = None,
     ) -> Moments:
         """Moments of a first-order moving-least-squares fit at query points.
 
@@ -221,6 +238,6 @@ def check_search(position: Tensor | None, radius: float, period: Tensor | None) 
         raise ValueError(f"{bad} particle positions are not finite; freeze or remove them before the search")
     if period is not None and bool((period < 3 * radius).any()):
         raise ValueError(
-            f"a periodic axis of length {float(period.min()):g} is shorter than three search radii ({3 * radius:g}); "
-            "use a finer spacing or a longer period"
+            f"a periodic axis of length {float(period.min()):g} is shorter than three search radii "
+            f"({3 * radius:g}); use a finer spacing or a longer period"
         )

@@ -1,4 +1,4 @@
-"""The compiled pair kernels: which library fits this processor, and its plain C interface seen through ctypes."""
+"""The compiled pair kernels: which library fits this processor, and its C interface through ctypes."""
 
 from __future__ import annotations
 
@@ -20,8 +20,13 @@ class SearchArguments(ctypes.Structure):
     """sph_search of csrc/interface.h."""
 
     _fields_ = [
-        ("particles", _long), ("position", _pointer), ("member", _pointer), ("radius", _real),
-        ("period", _real * 3), ("dimension", _int), ("threads", _int),
+        ("particles", _long),
+        ("position", _pointer),
+        ("member", _pointer),
+        ("radius", _real),
+        ("period", _real * 3),
+        ("dimension", _int),
+        ("threads", _int),
     ]
 
 
@@ -41,16 +46,40 @@ class PassArguments(ctypes.Structure):
     """sph_pass of csrc/interface.h."""
 
     _fields_ = [
-        ("dimension", _int), ("threads", _int), ("terms", ctypes.c_uint32),
-        ("weight", _int), ("form", _int), ("kernel", _int), ("support", _real), ("sigma", _real),
-        ("particles", _long), ("clusters", _long),
-        ("slot", _pointer), ("owner", _pointer), ("entries", _pointer), ("offset", _pointer), ("home", _pointer),
-        ("period", _real * 3), ("coefficients", _pointer),
-        ("position", _pointer), ("velocity", _pointer), ("mass", _pointer), ("deviation", _pointer),
-        ("pressure", _pointer), ("field", _pointer), ("active", _pointer),
-        ("divergence", _pointer), ("diffusion", _pointer), ("concentration", _pointer), ("xsph", _pointer),
-        ("acceleration", _pointer), ("shepard_volume", _pointer), ("shepard_mass", _pointer),
-        ("renormalisation", _pointer), ("laplacian", _pointer), ("diagonal", _pointer),
+        ("dimension", _int),
+        ("threads", _int),
+        ("terms", ctypes.c_uint32),
+        ("weight", _int),
+        ("form", _int),
+        ("kernel", _int),
+        ("support", _real),
+        ("sigma", _real),
+        ("particles", _long),
+        ("clusters", _long),
+        ("slot", _pointer),
+        ("owner", _pointer),
+        ("entries", _pointer),
+        ("offset", _pointer),
+        ("home", _pointer),
+        ("period", _real * 3),
+        ("coefficients", _pointer),
+        ("position", _pointer),
+        ("velocity", _pointer),
+        ("mass", _pointer),
+        ("deviation", _pointer),
+        ("pressure", _pointer),
+        ("field", _pointer),
+        ("active", _pointer),
+        ("divergence", _pointer),
+        ("diffusion", _pointer),
+        ("concentration", _pointer),
+        ("xsph", _pointer),
+        ("acceleration", _pointer),
+        ("shepard_volume", _pointer),
+        ("shepard_mass", _pointer),
+        ("renormalisation", _pointer),
+        ("laplacian", _pointer),
+        ("diagonal", _pointer),
     ]
 
 
@@ -58,10 +87,22 @@ class InterpolationArguments(ctypes.Structure):
     """sph_interpolation of csrc/interface.h."""
 
     _fields_ = [
-        ("particles", SearchArguments), ("fields", _pointer), ("columns", _long), ("queries", _long),
-        ("query", _pointer), ("query_member", _pointer), ("kernel", _int), ("support", _real), ("sigma", _real),
-        ("lengths", _pointer), ("count", _pointer), ("value", _pointer), ("first", _pointer), ("second", _pointer),
-        ("field", _pointer), ("field_first", _pointer),
+        ("particles", SearchArguments),
+        ("fields", _pointer),
+        ("columns", _long),
+        ("queries", _long),
+        ("query", _pointer),
+        ("query_member", _pointer),
+        ("kernel", _int),
+        ("support", _real),
+        ("sigma", _real),
+        ("lengths", _pointer),
+        ("count", _pointer),
+        ("value", _pointer),
+        ("first", _pointer),
+        ("second", _pointer),
+        ("field", _pointer),
+        ("field_first", _pointer),
     ]
 
 
@@ -86,13 +127,13 @@ def library() -> Library:
     """The library for the best instruction set of this processor, or for the one that ``TORCHSPH_ISA`` names.
 
     Raises:
-        LibraryMissing: nothing was compiled, or the forced instruction set is unknown or not in this processor.
+        LibraryMissing: nothing was compiled, or the forced instruction set is unknown or not here.
     """
     baseline = build.LIBRARIES / build.library_name("baseline")
     if not baseline.is_file():
         raise LibraryMissing(
-            f"the compiled kernels are not in {build.LIBRARIES}: the install found no C++ compiler. Install g++ or "
-            "clang++ and reinstall, or run 'python -m torchsph.pairs.build'"
+            f"the compiled kernels are not in {build.LIBRARIES}: the install found no C++ compiler. Install "
+            "g++ or clang++ and reinstall, or run 'python -m torchsph.pairs.build'"
         )
     runs = _load(baseline).sph_runs
     forced = os.environ.get(FORCED)
@@ -100,7 +141,9 @@ def library() -> Library:
         if forced not in PREFERENCE:
             raise LibraryMissing(f"{FORCED}={forced} is unknown; known: {', '.join(PREFERENCE)}")
         if not runs(forced.encode()):
-            raise LibraryMissing(f"{FORCED}={forced} asks for instructions that this processor lacks; unset it")
+            raise LibraryMissing(
+                f"{FORCED}={forced} asks for instructions that this processor lacks; unset it"
+            )
         return _choose((forced,))
     return _choose(tuple(isa for isa in PREFERENCE if runs(isa.encode())))
 
@@ -110,19 +153,26 @@ def _choose(candidates: tuple[str, ...]) -> Library:
         path = build.LIBRARIES / build.library_name(isa)
         if path.is_file():
             return Library(isa, _declare(_load(path)))
-    raise LibraryMissing(f"no library for {', '.join(candidates)} in {build.LIBRARIES}; run 'python -m torchsph.pairs.build'")
+    raise LibraryMissing(
+        f"no library for {', '.join(candidates)} in {build.LIBRARIES}; run 'python -m torchsph.pairs.build'"
+    )
 
 
 def _load(path: Path) -> ctypes.CDLL:
     try:
         return ctypes.CDLL(str(path))
     except OSError as problem:
-        raise LibraryMissing(f"{path} cannot be loaded ({problem}); rebuild with 'python -m torchsph.pairs.build'") from problem
+        raise LibraryMissing(
+            f"{path} cannot be loaded ({problem}); rebuild with 'python -m torchsph.pairs.build'"
+        ) from problem
 
 
 def _declare(handle: ctypes.CDLL) -> ctypes.CDLL:
     for reals in ("f32", "f64"):
-        getattr(handle, f"sph_sort_{reals}").argtypes = [ctypes.POINTER(SearchArguments), ctypes.POINTER(Sizes)]
+        getattr(handle, f"sph_sort_{reals}").argtypes = [
+            ctypes.POINTER(SearchArguments),
+            ctypes.POINTER(Sizes),
+        ]
         listing = getattr(handle, f"sph_list_{reals}")
         listing.argtypes = [ctypes.POINTER(SearchArguments), _long, ctypes.POINTER(ListArguments)]
         listing.restype = _long

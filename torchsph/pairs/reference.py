@@ -1,4 +1,4 @@
-"""The pair sums in plain torch: differentiable, float32 or float64, CPU or CUDA; the oracle of the fast backends."""
+"""The pair sums in plain torch: differentiable, float32 or float64, any device; the oracle of the others."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ TENSILE_POWER = 4
 
 @dataclass(frozen=True)
 class PairList:
-    """Every unordered pair once: indices (P,) and the periods that bring b next to a (None: no periodic axis)."""
+    """Every unordered pair once: indices (P,) and the periods that bring b next to a (None: no period)."""
 
     first: Tensor
     second: Tensor
@@ -40,12 +40,17 @@ class PairList:
 
 
 class ReferenceBackend(Backend):
-    """Eager torch on a list that holds each pair once; both sides of a pair are added from the same numbers."""
+    """Eager torch on a list that holds each pair once; both of its sides are added from the same numbers."""
 
     name = "reference"
 
     def search(
-        self, position: Tensor, member: Tensor, radius: float, *, margin: float = 0.0,
+        self,
+        position: Tensor,
+        member: Tensor,
+        radius: float,
+        *,
+        margin: float = 0.0,
         period: Tensor | None = None,
     ) -> PairList:
         check_search(position, radius + margin, period)
@@ -67,7 +72,9 @@ class ReferenceBackend(Backend):
             spread = -2.0 * geometry.factor * geometry.second_minus_first(state.deviation)
             out["diffusion"] = geometry.collect(vb * spread, -va * spread)
         if terms.concentration:
-            out["concentration"] = geometry.collect(vb[:, None] * geometry.gradient, -va[:, None] * geometry.gradient)
+            out["concentration"] = geometry.collect(
+                vb[:, None] * geometry.gradient, -va[:, None] * geometry.gradient
+            )
         if terms.xsph:
             ma, mb = geometry.ends(state.mass)
             da, db = geometry.ends(state.deviation)
@@ -76,8 +83,12 @@ class ReferenceBackend(Backend):
         if terms.shepard:
             centre = geometry.value_at_zero()
             ma, mb = geometry.ends(state.mass)
-            out["shepard_volume"] = geometry.collect(vb * geometry.value, va * geometry.value) + volume * centre
-            out["shepard_mass"] = geometry.collect(mb * geometry.value, ma * geometry.value) + state.mass * centre
+            out["shepard_volume"] = (
+                geometry.collect(vb * geometry.value, va * geometry.value) + volume * centre
+            )
+            out["shepard_mass"] = (
+                geometry.collect(mb * geometry.value, ma * geometry.value) + state.mass * centre
+            )
         if terms.renormalisation:
             outer = -geometry.gap[:, :, None] * geometry.gradient[:, None, :]
             out["renormalisation"] = geometry.collect(vb[:, None, None] * outer, va[:, None, None] * outer)
@@ -117,8 +128,15 @@ class ReferenceBackend(Backend):
         return geometry.collect(vb * drop, -va * drop), geometry.collect(vb * weight, va * weight)
 
     def interpolate(
-        self, position: Tensor, member: Tensor, fields: Tensor, support: Support, query: Tensor,
-        query_member: Tensor, *, period: Tensor | None = None,
+        self,
+        position: Tensor,
+        member: Tensor,
+        fields: Tensor,
+        support: Support,
+        query: Tensor,
+        query_member: Tensor,
+        *,
+        period: Tensor | None = None,
     ) -> Moments:
         check_search(torch.cat((position, query)), support.radius, period)
         row, particle = cross_pairs(query, query_member, position, member, support.radius, period)
@@ -132,8 +150,11 @@ class ReferenceBackend(Backend):
             return part.new_zeros((query.shape[0], *part.shape[1:])).index_add(0, row, part)
 
         return Moments(
-            collect((weight > 0).to(weight.dtype)), collect(weight), collect(first),
-            collect(first[:, :, None] * offset[:, None, :]), collect(weight[:, None] * carried),
+            collect((weight > 0).to(weight.dtype)),
+            collect(weight),
+            collect(first),
+            collect(first[:, :, None] * offset[:, None, :]),
+            collect(weight[:, None] * carried),
             collect(first[:, :, None] * carried[:, None, :]),
         )
 
@@ -169,7 +190,7 @@ class _Geometry:
         self.support = support
         self.gap = pairs.separation(state.position)
         self.square = (self.gap * self.gap).sum(1)
-        # the square root has no derivative at zero; the shift is far below a rounding error of any real distance
+        # the square root has no derivative at zero; the shift is far below the rounding of any real distance
         self.distance = torch.sqrt(self.square + torch.finfo(self.square.dtype).tiny)
         self._length = per_particle(support.length, state.member)
         self.length = self.first_of(self._length)
@@ -193,7 +214,9 @@ class _Geometry:
         return self.support.kernel.value(zero, self._length, self.support.dimension)
 
     def tensile_weight(self, reference: float) -> Tensor:
-        at = self.support.kernel.value(torch.full_like(self.distance, reference), self.length, self.support.dimension)
+        at = self.support.kernel.value(
+            torch.full_like(self.distance, reference), self.length, self.support.dimension
+        )
         return (self.value / at) ** TENSILE_POWER
 
     def ends(self, field: Tensor) -> tuple[Tensor, Tensor]:

@@ -22,7 +22,7 @@ class BackendStatus:
 
 
 def available_backends(device: str = "cpu") -> list[BackendStatus]:
-    """The backends known to the project, best first, with the reason why each can or cannot be used on ``device``."""
+    """The known backends, best first, each with the reason why it can or cannot be used on ``device``."""
     reference = BackendStatus("reference", True, "plain torch, any device, always present")
     return [_cpu_status(device), reference]
 
@@ -41,8 +41,8 @@ def backend(name: str = "auto", device: str = "cpu") -> Backend:
     """The backend called ``name``, or the best one that is present for "auto".
 
     Raises:
-        ValueError: the name is unknown, or the backend was asked for by name and is missing (the reason and the cure
-            are in the message; nothing slower is taken silently in its place).
+        ValueError: the name is unknown, or the backend was asked for by name and is missing (the reason and
+            the cure are in the message; nothing slower is taken silently in its place).
     """
     known = available_backends(device)
     if name == "auto":

@@ -1,4 +1,4 @@
-"""Neighbour search in plain torch: cells of the search radius, sorted keys, each unordered pair found once."""
+"""Neighbour search in plain torch: cells of the search radius, sorted keys, each pair found once."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ def half_pairs(
 ) -> tuple[Tensor, Tensor]:
     """All pairs of one member closer than ``radius``; every pair once, sorted by its first particle.
 
-    Cells are addressed by sorted keys, not by a dense table, so that a stray particle far away costs nothing and no
-    cell can overflow.
+    Cells are addressed by sorted keys, not by a dense table, so that a stray particle far away costs nothing
+    and no cell can overflow.
 
     Args:
         position: (N, D), finite. member: (N,) int64. radius: same unit as the positions.
@@ -53,7 +53,7 @@ def half_pairs(
 
 
 def _cells(position: Tensor, radius: float, period: Tensor | None) -> tuple[Tensor, Tensor]:
-    """Cell index (N, D) and number of cells (D,) of every axis; periodic axes hold a whole number of cells."""
+    """Cell index (N, D) and number of cells (D,) of every axis; periodic axes hold whole cells."""
     lower = position.amin(0)
     width = torch.full_like(lower, radius)
     if period is not None:
@@ -105,7 +105,7 @@ def _expand(start: Tensor, stop: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def nearest_image(gap: Tensor, period: Tensor | None) -> Tensor:
-    """Separations (P, D) between the nearest images of two particles; ``period`` (D,), inf where not periodic."""
+    """Separations (P, D) between the nearest images of two particles; ``period`` (D,): inf: not periodic."""
     if period is None:
         return gap
     finite = torch.isfinite(period)
@@ -119,10 +119,14 @@ def _square_distance(position: Tensor, first: Tensor, second: Tensor, period: Te
 
 
 def cross_pairs(
-    query: Tensor, query_member: Tensor, position: Tensor, member: Tensor, radius: float,
+    query: Tensor,
+    query_member: Tensor,
+    position: Tensor,
+    member: Tensor,
+    radius: float,
     period: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """All (query, particle) index pairs of one member closer than ``radius``, sorted by query; (P,) int64 each."""
+    """All (query, particle) index pairs of one member closer than ``radius``, sorted by query; (P,) each."""
     empty = torch.zeros(0, dtype=torch.int64, device=position.device)
     if query.shape[0] == 0 or position.shape[0] == 0:
         return empty, empty
