@@ -1,0 +1,111 @@
+"""How far to trust an estimate: standard deviations and weights fitted to what a tracker says of itself.
+
+The fit sees errors of simulations made for it alone, with their own seeds and flows; it is then used on others.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from .tracking import Estimates
+
+RIDGE = 1e-2  # pulls coefficients that the data leave open to zero, in units of one observation
+LEAST_VARIANCE = 1e-8  # (m/s)^2: 0.1 mm/s; below it the squares of errors would be round-off
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Log-linear models of the error variance, of components across and along the beam.
+
+    lateral, axial: coefficients on :func:`features`. reference: total standard deviation (m/s) of weight 1/2.
+    """
+
+    lateral: tuple[float, ...]
+    axial: tuple[float, ...]
+    reference: float
+
+    def sigma(self, estimates: Estimates, beam: Tensor) -> Tensor:
+        """Standard deviation (n, D), m/s, of the estimates; ``beam`` (n, D) unit vectors."""
+        lateral, axial = (torch.exp(self._log_variance(estimates, beam, part)) for part in (False, True))
+        along = beam.square()
+        return (lateral[:, None] * (1 - along) + axial[:, None] * along).sqrt()
+
+    def weight(self, estimates: Estimates, beam: Tensor) -> Tensor:
+        """Confidence (n,) in [0, 1], falling with the fitted deviation; 0 where an estimate is flagged."""
+        total = self.sigma(estimates, beam).square().sum(1)
+        return torch.where(estimates.accepted, 1 / (1 + total / self.reference**2), 0)
+
+    def _log_variance(self, estimates: Estimates, beam: Tensor, axial: bool) -> Tensor:
+        table = features(estimates, beam, axial)
+        return table @ table.new_tensor(self.axial if axial else self.lateral)
+
+
+def features(estimates: Estimates, beam: Tensor, axial: bool) -> Tensor:
+    """What the log variance is linear in, (n, 5): 1, predicted log variance, log(1 - rho), log peak ratio, dB of SNR.
+
+    All bounded, so that an odd estimate cannot ask for an absurd deviation. An unknown SNR counts as 20 dB.
+    """
+    along = beam.square()
+    share = along if axial else (1 - along) / max(beam.shape[1] - 1, 1)
+    predicted = (estimates.variance * share).sum(1).clamp(1e-10, 1.0).log()
+    decorrelation = (1 - estimates.correlation).clamp(1e-4, 1.0).log()
+    ratio = estimates.peak_ratio.clamp(1.0, 10.0).log()
+    snr = torch.nan_to_num(estimates.snr, nan=20.0).clamp(-10, 40) / 10
+    return torch.stack([torch.ones_like(predicted), predicted, decorrelation, ratio, snr], 1)
+
+
+def fit_calibration(estimates: Estimates, error: Tensor, beam: Tensor) -> Calibration:
+    """Fit to errors (n, D), m/s, of accepted estimates with beams (n, D). Needs at least 50 of them.
+
+    The variance of each class is exp(features . c), with c where the Gaussian likelihood of the errors is highest.
+    Its first equation is mean(error^2 / variance) = 1: outliers count in full, so the z-scores have unit variance.
+    """
+    kept = estimates.accepted
+    if int(kept.sum()) < 50:
+        raise ValueError(f"calibration needs 50 accepted estimates or more, got {int(kept.sum())}")
+    along = beam.square()
+    parts = []
+    for axial in (False, True):
+        share = along if axial else (1 - along) / max(beam.shape[1] - 1, 1)
+        square = (error.square() * share).sum(1).clamp_min(LEAST_VARIANCE)
+        table = features(estimates, beam, axial)[kept].double().cpu().numpy()
+        parts.append(_fit_log_variance(table, square[kept].double().cpu().numpy()))
+    model = Calibration(tuple(parts[0].tolist()), tuple(parts[1].tolist()), 1.0)
+    total = model.sigma(estimates, beam)[kept].square().sum(1).median().sqrt()
+    return Calibration(model.lateral, model.axial, float(total))
+
+
+def _fit_log_variance(table: np.ndarray, square: np.ndarray) -> np.ndarray:
+    """Coefficients minimising sum(log v + square / v), v = exp(table c): Newton's method, always convex."""
+    centre, scale = table.mean(0), table.std(0)
+    centre[0], scale[0] = 0.0, 1.0
+    scale[scale < 1e-9] = 1.0  # a feature that never varies gets no coefficient, by the ridge
+    design = (table - centre) / scale
+    design[:, 1:] *= table.std(0)[1:] >= 1e-9
+    ridge = RIDGE * np.eye(table.shape[1])
+    ridge[0, 0] = 0.0
+    coefficients = np.zeros(table.shape[1])
+    coefficients[0] = math.log(square.mean())
+    for _ in range(100):
+        ratio = square * np.exp(-design @ coefficients)
+        gradient = design.T @ (1 - ratio) + ridge @ coefficients
+        hessian = (design * ratio[:, None]).T @ design + ridge
+        step = np.linalg.solve(hessian, gradient)
+        step *= min(1.0, 1.0 / max(np.abs(design @ step).max(), 1e-12))  # at most a factor e of variance at a time
+        coefficients -= step
+        if np.abs(step).max() < 1e-8:
+            result = coefficients / scale
+            result[0] -= (coefficients[1:] * centre[1:] / scale[1:]).sum()
+            return result
+    raise ArithmeticError("the calibration did not converge; use more or other simulations")
+
+
+def joined(parts: list[Estimates]) -> Estimates:
+    """Estimates of several packets as one."""
+    names = Estimates.__dataclass_fields__
+    return Estimates(**{name: torch.cat([getattr(part, name) for part in parts]) for name in names})
