@@ -145,10 +145,10 @@ def test_record_without_any_observation_is_json_too():
 def test_failed_members_are_replaced_from_the_survivors():
     ensemble = 5 + draws(12, 3)
     ensemble[4, 1] = torch.nan
-    alive = torch.ones(12, dtype=torch.bool)
-    alive[7] = False
-    whole, events = replace_failed(ensemble, alive, torch.Generator().manual_seed(1))
-    again, _ = replace_failed(ensemble, alive, torch.Generator().manual_seed(1))
+    failed = torch.arange(12) == 7
+    repaired = replace_failed(ensemble, failed, torch.Generator().manual_seed(1))
+    again = replace_failed(ensemble, failed, torch.Generator().manual_seed(1)).ensemble
+    whole, events = repaired.ensemble, repaired.events
     keep = [k for k in range(12) if k not in (4, 7)]
     assert torch.equal(whole, again) and torch.isfinite(whole).all()
     assert torch.equal(whole[keep], ensemble[keep])
@@ -160,11 +160,11 @@ def test_failed_members_are_replaced_from_the_survivors():
 def test_replacements_have_the_survivors_mean_and_covariance():
     ensemble = draws(4000, 2) @ torch.tensor([[1.0, 0.5], [0.0, 2.0]]).double()
     ensemble[2000:] = torch.nan
-    alive = torch.ones(4000, dtype=torch.bool)
-    whole, _ = replace_failed(ensemble, alive, torch.Generator().manual_seed(1))
+    none = torch.zeros(4000, dtype=torch.bool)
+    whole = replace_failed(ensemble, none, torch.Generator().manual_seed(1)).ensemble
     assert torch.allclose(torch.cov(whole[2000:].T), torch.cov(whole[:2000].T), rtol=0.1, atol=0.1)
 
 
 def test_a_dead_ensemble_is_an_error():
     with pytest.raises(AssimilationError, match="only 1 of 3"):
-        replace_failed(draws(3, 2), torch.tensor([True, False, False]), torch.Generator())
+        replace_failed(draws(3, 2), torch.tensor([False, True, True]), torch.Generator())

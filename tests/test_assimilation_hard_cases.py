@@ -30,7 +30,7 @@ def white(count, generator):
 
 class Run:
     """Lorenz-96, every variable observed with variance 1; `observe(cycle, value)` may spoil the values and
-    `disturb(cycle, ensemble, alive)` the members."""
+    `disturb(cycle, ensemble)` the members."""
 
     def __init__(self, filter_, members=8, cycles=180, observe=None, disturb=None, seed=0):
         draw = torch.Generator().manual_seed(seed)
@@ -43,8 +43,8 @@ class Run:
             if observe is not None:
                 value = observe(cycle, value, draw)
             if disturb is not None:
-                ensemble, events = replace_failed(*disturb(cycle, ensemble), draw, fresh=white)
-                self.events += events
+                repaired = replace_failed(*disturb(cycle, ensemble), draw, fresh=white)
+                ensemble, self.events = repaired.ensemble, self.events + list(repaired.events)
             seen = Observations(value, torch.ones(40).double(), PLACE)
             analysis = filter_.analyse(ensemble, ensemble, seen, state_positions=PLACE, generator=draw)
             self.record.add(0.05 * cycle, analysis, seen, forecast=ensemble, truth=truth)
@@ -69,10 +69,9 @@ def test_ten_cycles_without_any_observation():
 
 def test_a_member_fails_in_each_cycle():
     def disturb(cycle, ensemble):
-        alive = torch.ones(len(ensemble), dtype=torch.bool)
-        ensemble = ensemble.clone()
-        ensemble[cycle % len(ensemble), cycle % 40] = torch.nan
-        return ensemble, alive
+        broken = ensemble.clone()
+        broken[cycle % len(ensemble), cycle % 40] = torch.nan
+        return broken, torch.zeros(len(ensemble), dtype=torch.bool)
 
     run = Run(local(Multiplicative(1.05)), members=10, disturb=disturb)
     assert len(run.events) == 180

@@ -19,7 +19,7 @@ from .diagnostics import (
 from .enkf import StochasticEnKF
 from .errors import AssimilationError
 from .etkf import ETKF
-from .failures import Replacement, replace_failed
+from .failures import Repaired, Replacement, replace_failed
 from .filters import Analysis, EnsembleFilter, Filter, GlobalTransform, Transform, check_ensemble
 from .hybrid import HybridGain
 from .inflation import RTPP, RTPS, Adaptive, Inflation, Multiplicative
@@ -59,6 +59,7 @@ __all__ = [
     "Parameter",
     "Reason",
     "ReducedUnscented",
+    "Repaired",
     "Replacement",
     "Screened",
     "SigmaPoints",

@@ -20,14 +20,22 @@ class Replacement:
     donor: int
 
 
+@dataclass(frozen=True)
+class Repaired:
+    """The whole ensemble `(N, n)` and an event per member that was replaced."""
+
+    ensemble: Tensor
+    events: tuple[Replacement, ...]
+
+
 def replace_failed(
     ensemble: Tensor,
-    alive: Tensor,
+    failed: Tensor,
     generator: torch.Generator,
     *,
     fresh: Callable[[int, torch.Generator], Tensor] | None = None,
     share: float = 0.5,
-) -> tuple[Tensor, tuple[Replacement, ...]]:
+) -> Repaired:
     """The ensemble with each failed member drawn anew from the survivors' mean and covariance.
 
     A copy of a survivor would count its information twice; a random combination of the survivors' anomalies,
@@ -37,41 +45,39 @@ def replace_failed(
 
     Args:
         ensemble: `(N, n)`.
-        alive: `(N,)` bool; members that are not finite count as failed whatever it says.
+        failed: `(N,)` bool; members that are not finite count as failed whatever it says.
         fresh: `(count, generator) -> (count, n)` perturbations of any size, admissible in the model.
         share: of the variance that is fresh, in [0, 1]; used with `fresh` only.
 
-    Returns:
-        The whole ensemble, and an event per failed member; donors are the survivors in turn from a random
-        start.
+    Donors are the survivors in turn from a random start.
 
     Raises:
         AssimilationError: fewer than two survivors.
     """
     if not 0 <= share <= 1:
         raise AssimilationError(f"the fresh share of the variance must lie in [0, 1], got {share}")
-    alive = alive & torch.isfinite(ensemble).all(-1)
-    survivors, failed = torch.nonzero(alive).squeeze(-1), torch.nonzero(~alive).squeeze(-1)
+    failed = failed.to(ensemble.device) | ~torch.isfinite(ensemble).all(-1)
+    survivors, lost = torch.nonzero(~failed).squeeze(-1), torch.nonzero(failed).squeeze(-1)
     if len(survivors) < 2:
         raise AssimilationError(
             f"only {len(survivors)} of {len(ensemble)} members are alive: an ensemble cannot be rebuilt"
         )
-    if not len(failed):
-        return ensemble, ()
+    if not len(lost):
+        return Repaired(ensemble, ())
     living = ensemble[survivors].double()
-    drawn = _combinations(living, len(failed), generator)
+    drawn = _combinations(living, len(lost), generator)
     if fresh is not None:
-        new = fresh(len(failed), generator).double()
+        new = fresh(len(lost), generator).double()
         size = living.var(0).mean().sqrt() / new.square().mean().sqrt()
         drawn = (1 - share) ** 0.5 * drawn + share**0.5 * size * new
     start = int(torch.randint(len(survivors), (1,), generator=generator, device=generator.device))
     events = tuple(
         Replacement(int(member), int(survivors[(start + k) % len(survivors)]))
-        for k, member in enumerate(failed)
+        for k, member in enumerate(lost)
     )
     whole = ensemble.clone()
-    whole[failed] = (living.mean(0) + drawn).to(ensemble.dtype)
-    return whole, events
+    whole[lost] = (living.mean(0) + drawn).to(ensemble.dtype)
+    return Repaired(whole, events)
 
 
 def _combinations(members: Tensor, count: int, generator: torch.Generator) -> Tensor:
