@@ -42,7 +42,7 @@ class OrificePlane:
         return (self.rim - self.centroid) @ self.basis.T
 
     def height(self, points: Tensor) -> Tensor:
-        """Distance (m) of points `(n, D)` from the plane, `(n,)`: positive outwards, negative in the blood."""
+        """Distance (m) of points `(n, D)` from the plane, `(n,)`: positive outwards, out of the blood."""
         return (points - points.new_tensor(self.centroid)) @ points.new_tensor(self.normal)
 
     def lateral(self, points: Tensor) -> Tensor:
@@ -50,7 +50,7 @@ class OrificePlane:
         return (points - points.new_tensor(self.centroid)) @ points.new_tensor(self.basis).T
 
     def lateral_distance(self, points: Tensor) -> Tensor:
-        """In-plane distance (m) of points `(n, D)` to the rim, `(n,)`: positive over the opening, else negative.
+        """In-plane distance (m) of points `(n, D)` to the rim, `(n,)`: positive over the opening only.
 
         Exact for the polygon. Cost is points times rim edges; narrow the points down by `height` first where
         many lie far away.

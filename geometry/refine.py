@@ -10,7 +10,7 @@ from scipy.sparse import coo_array, csr_array, eye_array, vstack
 from .motion import WallMotion
 from .surface import Surface, SurfaceError
 
-ROUNDS = 24  # halvings of an edge; more would be a spacing a million times below the mesh
+MOST_FACES = 20_000_000  # several gigabytes; a spacing that asks for more is a mistake of units
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,22 +46,20 @@ def refinement(surface: Surface, spacing: float) -> Refinement:
     """Halve edges longer than `spacing` (m), and cut the faces beside them, until there is none."""
     if not spacing > 0:
         raise SurfaceError(f"refined: spacing must be positive (m), not {spacing}")
+    finest = np.maximum(surface.areas / (0.43 * spacing ** (surface.dimension - 1)), 1).sum()
+    if finest > MOST_FACES:
+        raise SurfaceError(f"refined: a spacing of {spacing:g} m asks for {finest:.1g} faces: is it in m?")
     weights = eye_array(len(surface.vertices), format="csr")
     parent = np.arange(len(surface.faces))
-    for _ in range(ROUNDS):
+    while True:
         faces, ends, source = _halved(surface, spacing)
         if len(ends) == 0:
             return Refinement(surface, parent, csr_array(weights))
-        rows = np.repeat(np.arange(len(ends)), 2)
-        middle = coo_array(
-            (np.full(len(rows), 0.5), (rows, ends.ravel())), shape=(len(ends), weights.shape[0])
-        )
-        weights = vstack([weights, csr_array(middle) @ weights], format="csr")
+        rows, half = np.repeat(np.arange(len(ends)), 2), np.full(2 * len(ends), 0.5)
+        middle = csr_array(coo_array((half, (rows, ends.ravel())), shape=(len(ends), weights.shape[0])))
+        weights = vstack([weights, middle @ weights], format="csr")
         vertices = np.concatenate([surface.vertices, surface.vertices[ends].mean(axis=1)])
         surface, parent = Surface(vertices, faces, surface.region[source]), parent[source]
-    raise SurfaceError(
-        f"refined: a spacing of {spacing:g} m asks for more than {ROUNDS} halvings of the mesh"
-    )
 
 
 def _halved(surface: Surface, spacing: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -85,7 +83,7 @@ def _halved(surface: Surface, spacing: float) -> tuple[np.ndarray, np.ndarray, n
 
 
 def _cut_faces(vertices: np.ndarray, faces: np.ndarray, middle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Cut triangles by the new vertices on their sides (-1: none) into 2, 3 or 4, whichever sides are halved."""
+    """Cut triangles by the new vertices on their sides (-1: none) into 2, 3 or 4, as sides are halved."""
     halved = (middle >= 0).sum(axis=1)
     parts, source = [faces[halved == 0]], [np.flatnonzero(halved == 0)]
 

@@ -88,7 +88,7 @@ def _numbered_alike(surface: Surface) -> np.ndarray:
 
 
 def _closed(surface: Surface, region: int) -> Surface:
-    """Every hole closed: in a plane by an edge between the two ends, else by a fan around its rim's middle."""
+    """Every hole closed: in a plane by an edge between the ends, else by a fan around the rim's middle."""
     if surface.open_ridges == 0:
         return surface
     if surface.dimension == 2:

@@ -23,7 +23,7 @@ class SearchPoints(NamedTuple):
 
 
 def search_points(surface: Surface, longest: np.ndarray, step: float) -> SearchPoints:
-    """Search points at most `step` (m) apart along edges; `longest` (nf,) is the longest edge of each face."""
+    """Search points at most `step` (m) apart on edges; `longest` (nf,) is the longest edge of each face."""
     # Powers of two, so that the points on an edge belong to the lattices of the faces on both of its sides.
     cuts = 2 ** np.ceil(np.log2(np.maximum(longest / step, 1))).astype(np.int64)
     used, place = np.unique(surface.faces, return_inverse=True)

@@ -1,14 +1,18 @@
 """Surfaces from point clouds, masks and velocity by Delaunay triangulation with an explicit concavity rule.
 
-The thesis (section 3.4) sent the boundary points of a thresholded velocity to qhull and took the convex
-result. Here the triangulation keeps the simplices whose circumscribed sphere is no larger than alpha
-(Edelsbrunner and Muecke 1994, "Three-dimensional alpha shapes"), so that concavities wider than 2 alpha
-appear; an infinite alpha is the convex hull.
+The thesis (section 3.4) sent the boundary points of a thresholded velocity to qhull, whose simplices together
+fill the convex hull. Which of them are the body is decided here by a rule: for a cloud of points those whose
+circumscribed sphere is no larger than alpha (Edelsbrunner and Muecke 1994, "Three-dimensional alpha shapes"),
+so that concavities wider than 2 alpha appear and an infinite alpha is the convex hull; for a mask those whose
+middle lies inside it.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
+import torch
 from scipy import ndimage
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
@@ -17,8 +21,8 @@ from scipy.spatial import Delaunay, QhullError
 from .grid import Grid
 from .surface import Surface, SurfaceError
 
-# qhull triangulates points on a common sphere, as on a grid, in pieces without volume; a shift of this part
-# of the points' spacing, used for the choice of simplices only, makes the choice unique.
+# qhull triangulates points on a common sphere, as on a grid, in pieces without volume. Moving the points by
+# this part of their spacing, for the triangulation only, makes it unique and all its pieces regular.
 JOGGLE = 1e-4
 
 
@@ -34,35 +38,27 @@ def surface_from_points(points: np.ndarray, *, alpha: float) -> Surface:
         raise SurfaceError(f"surface_from_points: points must be finite (n, 2) or (n, 3), not {points.shape}")
     if not alpha > 0:
         raise SurfaceError(f"surface_from_points: alpha must be a positive length (m), not {alpha}")
-    simplices, neighbours = _delaunay(points)
-    keep = _circumradius(points[simplices]) <= alpha
+    mesh = _delaunay(points)
+    keep = mesh.circumradius() <= alpha
     if not keep.any():
         raise SurfaceError(f"surface_from_points: no simplex is as small as alpha = {alpha:g} m; raise it")
-    keep = _largest_body(points, simplices, neighbours, keep)
-    faces = _boundary(points, simplices, neighbours, _without_cavities(neighbours, keep))
-    used, place = np.unique(faces, return_inverse=True)
-    return Surface(points[used], place.reshape(faces.shape))
+    return mesh.surface(keep)
 
 
-def surface_from_mask(
-    mask: np.ndarray, grid: Grid, *, alpha: float | None = None, smoothing: int = 0
-) -> Surface:
+def surface_from_mask(mask: np.ndarray, grid: Grid, *, alpha: float = np.inf, smoothing: int = 0) -> Surface:
     """The surface of a segmentation `mask` (*shape), True inside: of its largest connected part, filled.
 
-    The surface runs midway between nodes inside and outside. `alpha` (m) as above; the default, 1.1 half
-    diagonals of a cell, follows every concavity of the mask. `smoothing` passes of Taubin's filter (1995,
-    which does not shrink) take the steps out of it. Raises SurfaceError for an empty mask.
+    It runs midway between nodes inside and outside and follows every concavity of the mask: a simplex belongs
+    to the body where the mask, interpolated at its middle, is at least a half; `alpha` (m) may limit it
+    further. `smoothing` passes of Taubin's filter take the steps out. Raises SurfaceError for an empty mask.
     """
     mask = np.asarray(mask).astype(bool)
     if mask.shape != grid.shape:
-        raise SurfaceError(
-            f"surface_from_mask: the mask must have the grid's shape {grid.shape}, not {mask.shape}"
-        )
-    body = _filled(mask)
-    inside = grid.nodes().numpy()[body.ravel()]
-    points = np.concatenate([inside, _midway(body, grid)])
-    size = 0.55 * float(np.linalg.norm(grid.spacing)) if alpha is None else alpha
-    surface = surface_from_points(points, alpha=size)
+        raise SurfaceError(f"surface_from_mask: the mask {mask.shape} does not fit the grid {grid.shape}")
+    body, wide = np.pad(_filled(mask), 1), grid.padded(1)
+    mesh = _delaunay(np.concatenate([wide.nodes().numpy()[body.ravel()], _midway(body, wide)]))
+    level = wide.sample(torch.as_tensor(body, dtype=torch.float64), torch.as_tensor(mesh.middles()))
+    surface = mesh.surface((level.numpy() >= 0.5) & (mesh.circumradius() <= alpha))
     return taubin(surface, smoothing) if smoothing else surface
 
 
@@ -71,7 +67,7 @@ def surface_from_velocity(
     grid: Grid,
     *,
     threshold: float = 0.0,
-    alpha: float | None = None,
+    alpha: float = np.inf,
     smoothing: int = 0,
 ) -> Surface:
     """The surface around the nodes whose speed exceeds `threshold` (m/s), as in the thesis (section 4.1).
@@ -109,75 +105,85 @@ def taubin(surface: Surface, passes: int, *, shrink: float = 0.5, inflate: float
     return surface.moved(vertices)
 
 
-def _delaunay(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    spread = (points.max(axis=0) - points.min(axis=0)).max() / max(len(points), 1) ** (1 / points.shape[1])
-    # A fixed sequence: the same points give the same surface.
-    shift = np.random.default_rng(0).uniform(-JOGGLE, JOGGLE, points.shape) * spread
+@dataclass(frozen=True, eq=False)
+class _Simplices:
+    """A Delaunay triangulation: `points`, as `moved` for it, corners and neighbours of the simplices."""
+
+    points: np.ndarray
+    moved: np.ndarray
+    corners: np.ndarray
+    neighbours: np.ndarray
+
+    def middles(self) -> np.ndarray:
+        """Centroids of the simplices, `(n, D)`."""
+        return self.moved[self.corners].mean(axis=1)
+
+    def circumradius(self) -> np.ndarray:
+        """Radius of the sphere through the corners of each simplex, `(n,)`."""
+        corner = self.moved[self.corners]
+        along = corner[:, 1:] - corner[:, :1]
+        centre = np.linalg.solve(2 * along, (along**2).sum(axis=2)[..., None])[..., 0]
+        return np.sqrt((centre**2).sum(axis=1))
+
+    def surface(self, keep: np.ndarray) -> Surface:
+        """The outer surface of the largest connected body among the kept simplices."""
+        body = self._with_cavities(self._largest(keep))
+        faces = self._boundary(body)
+        used, place = np.unique(faces, return_inverse=True)
+        return Surface(self.points[used], place.reshape(faces.shape))
+
+    def _linked(self, chosen: np.ndarray, *more: np.ndarray) -> np.ndarray:
+        """Labels of the pieces in which chosen simplices hang together by faces; `more` adds pairs."""
+        row, side = np.nonzero((self.neighbours >= 0) & chosen[:, None])
+        other = self.neighbours[row, side]
+        pairs = np.stack([row, other])[:, chosen[other]]
+        pairs = np.concatenate([pairs, *more], axis=1)
+        size = len(self.corners) + 1
+        graph = coo_array((np.ones(pairs.shape[1], np.int8), (pairs[0], pairs[1])), shape=(size, size))
+        return connected_components(graph, directed=False)[1]
+
+    def _largest(self, keep: np.ndarray) -> np.ndarray:
+        label = self._linked(keep)[:-1]
+        corner = self.moved[self.corners]
+        volume = np.abs(np.linalg.det(corner[:, 1:] - corner[:, :1])) * keep
+        return keep & (label == np.bincount(label, weights=volume).argmax())
+
+    def _with_cavities(self, keep: np.ndarray) -> np.ndarray:
+        """Kept simplices and all others that are not connected to the outside, which is the last label."""
+        rim = np.flatnonzero((self.neighbours < 0).any(axis=1) & ~keep)
+        label = self._linked(~keep, np.stack([rim, np.full(len(rim), len(keep))]))
+        return keep | (label[:-1] != label[-1])
+
+    def _boundary(self, keep: np.ndarray) -> np.ndarray:
+        """Faces between kept simplices and the rest, numbered outwards."""
+        beyond = np.where(self.neighbours >= 0, ~keep[self.neighbours], True)
+        row, corner = np.nonzero(keep[:, None] & beyond)
+        count = self.corners.shape[1]
+        others = np.array([[k for k in range(count) if k != c] for c in range(count)])
+        faces = np.take_along_axis(self.corners[row], others[corner], axis=1)
+        first = self.moved[faces[:, 0]]
+        inner = self.moved[self.corners[row, corner]] - first
+        along = self.moved[faces[:, 1:]] - first[:, None]
+        volume = np.linalg.det(np.concatenate([along, inner[:, None]], axis=1))
+        # In a plane the body lies to the left of an edge; in space it lies behind a face seen
+        # counter-clockwise.
+        turn = volume < 0 if count == 3 else volume > 0
+        faces[turn] = faces[turn][:, ::-1]
+        return faces
+
+
+def _delaunay(points: np.ndarray) -> _Simplices:
+    # Sorted, so that each point is moved alike in whatever order the points come.
+    points = points[np.lexsort(points.T)]
+    spread = (points.max(axis=0) - points.min(axis=0)).max() / len(points) ** (1 / points.shape[1])
+    moved = points + np.random.default_rng(0).uniform(-JOGGLE, JOGGLE, points.shape) * spread
     try:
-        result = Delaunay(points + shift)
+        result = Delaunay(moved)
     except (QhullError, ValueError) as fault:
         reason = str(fault).strip().splitlines()[0]
-        raise SurfaceError(
-            f"surface_from_points: {len(points)} points cannot be triangulated ({reason})"
-        ) from fault
-    return result.simplices, result.neighbors
-
-
-def _circumradius(corner: np.ndarray) -> np.ndarray:
-    """Radius of the sphere through the corners `(n, D + 1, D)`; infinite for simplices without volume."""
-    along = corner[:, 1:] - corner[:, :1]
-    square = (along**2).sum(axis=2)
-    scale = np.sqrt(square.max(axis=1))
-    flat = np.abs(np.linalg.det(along)) <= 1e-12 * scale ** corner.shape[2]
-    along[flat] = np.eye(corner.shape[2])
-    centre = np.linalg.solve(2 * along, square[..., None])[..., 0]
-    return np.where(flat, np.inf, np.sqrt((centre**2).sum(axis=1)))
-
-
-def _largest_body(points, simplices, neighbours, keep) -> np.ndarray:
-    row, side = np.nonzero((neighbours >= 0) & keep[:, None])
-    other = neighbours[row, side]
-    linked = keep[other]
-    graph = coo_array(
-        (np.ones(linked.sum(), np.int8), (row[linked], other[linked])), shape=(len(simplices),) * 2
-    )
-    label = connected_components(graph, directed=False)[1]
-    corner = points[simplices]
-    volume = np.abs(np.linalg.det(corner[:, 1:] - corner[:, :1])) * keep
-    return keep & (label == np.bincount(label, weights=volume).argmax())
-
-
-def _without_cavities(neighbours: np.ndarray, keep: np.ndarray) -> np.ndarray:
-    """Kept simplices and all others that are not connected to the outside of the hull."""
-    row, side = np.nonzero((neighbours >= 0) & ~keep[:, None])
-    other = neighbours[row, side]
-    linked = ~keep[other]
-    outside = len(keep)
-    open_to = np.flatnonzero((neighbours < 0).any(axis=1) & ~keep)
-    rows = np.concatenate([row[linked], open_to])
-    columns = np.concatenate([other[linked], np.full(len(open_to), outside)])
-    graph = coo_array((np.ones(len(rows), np.int8), (rows, columns)), shape=(outside + 1,) * 2)
-    label = connected_components(graph, directed=False)[1]
-    return keep | (label[:-1] != label[outside])
-
-
-def _boundary(points, simplices, neighbours, keep) -> np.ndarray:
-    """Faces between kept simplices and the rest, numbered outwards."""
-    beyond = np.where(neighbours >= 0, ~keep[neighbours], True)
-    row, corner = np.nonzero(keep[:, None] & beyond)
-    dimension = points.shape[1]
-    others = np.array([[k for k in range(dimension + 1) if k != c] for c in range(dimension + 1)])
-    faces = np.take_along_axis(simplices[row], others[corner], axis=1)
-    apex = points[simplices[row, corner]]
-    first = points[faces[:, 0]]
-    along = points[faces[:, 1:]] - first[:, None]
-    # In a plane, an edge followed counter-clockwise has the body on its left; in space, the normal points
-    # away from it.
-    matrix = np.concatenate([along, (apex - first)[:, None]], axis=1)
-    inward = np.linalg.det(matrix) > 0
-    turn = ~inward if dimension == 2 else inward
-    faces[turn] = faces[turn][:, ::-1]
-    return faces
+        text = f"surface_from_points: {len(points)} points cannot be triangulated ({reason})"
+        raise SurfaceError(text) from fault
+    return _Simplices(points, moved, result.simplices, result.neighbors)
 
 
 def _filled(mask: np.ndarray) -> np.ndarray:
@@ -189,13 +195,10 @@ def _filled(mask: np.ndarray) -> np.ndarray:
 
 
 def _midway(body: np.ndarray, grid: Grid) -> np.ndarray:
-    """Points halfway between nodes inside and neighbours outside, also off the grid's box: `(n, D)`, m."""
-    padded = np.pad(body, 1)
+    """Points halfway between nodes inside and neighbours outside, `(n, D)`, m."""
     found = []
     for axis in range(body.ndim):
-        low = np.moveaxis(padded, axis, 0)
-        index = np.argwhere(low[1:] != low[:-1]).astype(np.float64)
-        index[:, 0] += 0.5
-        index = np.insert(index[:, 1:], axis, index[:, 0], axis=1) - 1.0
+        index = np.argwhere(np.diff(body, axis=axis)).astype(np.float64)
+        index[:, axis] += 0.5
         found.append(np.asarray(grid.origin) + index[:, ::-1] * np.asarray(grid.spacing))
     return np.concatenate(found)

@@ -98,7 +98,7 @@ class Surface:
     @cached_property
     def normals(self) -> np.ndarray:
         """Outward unit normal of each face, `(nf, D)`; zero for a face without area."""
-        return _unit(self.area_vectors)
+        return unit(self.area_vectors)
 
     @property
     def centroids(self) -> np.ndarray:
@@ -113,9 +113,9 @@ class Surface:
         vertices.
         """
         total = np.zeros_like(self.vertices)
-        for corner, angle in enumerate(self._angles()):
+        for corner, angle in enumerate(self.corner_angles()):
             np.add.at(total, self.faces[:, corner], self.normals * angle[:, None])
-        return _unit(total)
+        return unit(total)
 
     @cached_property
     def volume(self) -> float:
@@ -208,13 +208,14 @@ class Surface:
         place, sign = ridges_of(self.faces, len(self.vertices))
         return np.bincount(place, weights=sign), np.bincount(place)
 
-    def _angles(self) -> list[np.ndarray]:
+    def corner_angles(self) -> list[np.ndarray]:
+        """Angle (rad) of every face at its first, second, third corner, `(nf,)` each; 1 in a plane."""
         if self.dimension == 2:
             return [np.ones(len(self.faces))] * 2
         corner = self.vertices[self.faces]
         result = []
         for k in range(3):
-            a, b = _unit(corner[:, (k + 1) % 3] - corner[:, k]), _unit(corner[:, (k + 2) % 3] - corner[:, k])
+            a, b = unit(corner[:, (k + 1) % 3] - corner[:, k]), unit(corner[:, (k + 2) % 3] - corner[:, k])
             result.append(np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), (a * b).sum(1)))
         return result
 
@@ -235,6 +236,7 @@ def ridges_of(faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     return np.unique(key, return_inverse=True)[1], sign
 
 
-def _unit(vectors: np.ndarray) -> np.ndarray:
+def unit(vectors: np.ndarray) -> np.ndarray:
+    """Vectors `(..., D)` divided by their length; zero stays zero."""
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     return np.divide(vectors, length, out=np.zeros_like(vectors), where=length > 0)

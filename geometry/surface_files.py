@@ -48,7 +48,7 @@ def read_surface(path: str | Path, *, scale: float = 1.0, mend: bool = True) -> 
 
 
 def write_surface(path: str | Path, surface: Surface, *, scale: float = 1.0) -> None:
-    """Write a 3-D surface as STL, OBJ or PLY by its suffix, in units of `scale` (m); PLY keeps the regions."""
+    """Write a 3-D surface as STL, OBJ or PLY by suffix, in units of `scale` (m); PLY keeps the regions."""
     path = Path(path)
     if path.suffix.lower() not in SUFFIXES:
         raise SurfaceError(

@@ -14,11 +14,11 @@ from scipy.sparse import coo_array, csr_array
 
 from .motion import WallMotion
 from .search_points import repeated, sub_triangles
-from .surface import Surface
+from .surface import Surface, unit
 
 
 class WallPoints(NamedTuple):
-    """Points (m), unit normals out of the blood, velocities (m/s), all `(n, D)`, areas (m^2), region `(n,)`."""
+    """Points (m), normals out of the blood, velocities (m/s), all `(n, D)`, areas (m^2), region `(n,)`."""
 
     points: np.ndarray
     normals: np.ndarray
@@ -30,33 +30,37 @@ class WallPoints(NamedTuple):
 class WallSampler:
     """Points about `spacing` (m) apart on a moving wall.
 
-    `smooth_angle` (degrees): normals are interpolated between the angle-weighted normals of the vertices, but
-    a point keeps the normal of its own faces where the two differ by more than this, as along the rim of a
-    base; 0 keeps it everywhere. The areas add up to the area of the wall, and with `smooth_angle=0` and faces
-    larger than the spacing the sum of area * normal . velocity is dV/dt to round-off. Raises ValueError for a
-    spacing or angle out of range.
+    `smooth_angle` (degrees): normals are interpolated between the corners of a face, and a corner's normal is
+    the angle-weighted mean over the faces around it whose normals differ by less than this from the face's
+    own, so that curves are smooth and the rim of a base stays sharp; 0 gives the normals of the faces. The
+    areas add up to the area of the wall; with `smooth_angle=0` and faces larger than the spacing the sum of
+    area * normal . velocity is dV/dt to round-off. Raises ValueError for a spacing or angle out of range.
     """
 
-    def __init__(self, motion: WallMotion, spacing: float, *, smooth_angle: float = 30.0) -> None:
+    def __init__(self, motion: WallMotion, spacing: float, *, smooth_angle: float = 40.0) -> None:
         if not spacing > 0 or not 0 <= smooth_angle < 90:
-            raise ValueError(
+            text = (
                 f"WallSampler: needs spacing > 0 and 0 <= smooth_angle < 90, not {spacing} and {smooth_angle}"
             )
-        self.motion, self._cosine = motion, float(np.cos(np.radians(smooth_angle)))
-        self._smooth = smooth_angle > 0
+            raise ValueError(text)
+        self.motion = motion
         surface = motion.surface(float(motion.time[0]))
         owner, weights = _cut(surface, spacing)
         group = _gather(surface, owner, weights, spacing)
-        count, share = int(group.max()) + 1, 1 / np.bincount(owner)[owner]
+        count, faces = int(group.max()) + 1, len(surface.faces)
+        share = 1 / np.bincount(owner)[owner]
         area = share * surface.areas[owner]
-        mean = area / np.bincount(group, weights=area)[group]
+        mean = (area / np.bincount(group, weights=area)[group])[:, None] * weights
         rows = np.repeat(group, surface.dimension)
-        columns = surface.faces[owner].ravel()
-        size = (count, len(surface.vertices))
         # Points and velocities as means over vertices, area vectors as sums over faces: linear maps, made
         # once.
-        self._mean = csr_array(coo_array(((mean[:, None] * weights).ravel(), (rows, columns)), shape=size))
-        self._sum = csr_array(coo_array((share, (group, owner)), shape=(count, len(surface.faces))))
+        self._mean = _sparse(mean, rows, surface.faces[owner], (count, len(surface.vertices)))
+        self._sum = _sparse(share, group, owner, (count, faces))
+        self._corners = self._blend = None
+        if smooth_angle > 0:
+            corner = owner[:, None] * surface.dimension + np.arange(surface.dimension)
+            self._corners = _sparse(mean, rows, corner, (count, faces * surface.dimension))
+            self._blend = _corner_blend(surface, float(np.cos(np.radians(smooth_angle))))
         self.region = surface.region[owner[np.unique(group, return_index=True)[1]]]
 
     def __len__(self) -> int:
@@ -65,21 +69,15 @@ class WallSampler:
     def at(self, t: float) -> WallPoints:
         """The points at time `t` (s)."""
         surface = self.motion.surface(t)
-        vectors = self._sum @ surface.area_vectors
-        length = np.linalg.norm(vectors, axis=1, keepdims=True)
-        normals = np.divide(vectors, length, out=np.zeros_like(vectors), where=length > 0)
-        if self._smooth:
-            smooth = self._mean @ surface.vertex_normals
-            size = np.linalg.norm(smooth, axis=1, keepdims=True)
-            near = (smooth * normals).sum(axis=1, keepdims=True) > self._cosine * size
-            normals = np.divide(smooth, size, out=normals.copy(), where=near & (size > 0))
-        velocities = self._mean @ self.motion.velocity(t)
-        return WallPoints(
-            self._mean @ surface.vertices, normals, velocities, self._sum @ surface.areas, self.region
-        )
+        if self._blend is None:
+            normals = unit(self._sum @ surface.area_vectors)
+        else:
+            normals = unit(self._corners @ unit(self._blend @ surface.normals))
+        points, velocities = self._mean @ surface.vertices, self._mean @ self.motion.velocity(t)
+        return WallPoints(points, normals, velocities, self._sum @ surface.areas, self.region)
 
 
-def wall_points(motion: WallMotion, t: float, spacing: float, *, smooth_angle: float = 30.0) -> WallPoints:
+def wall_points(motion: WallMotion, t: float, spacing: float, *, smooth_angle: float = 40.0) -> WallPoints:
     """Points about `spacing` (m) apart on the wall at time `t` (s); for many times keep a `WallSampler`."""
     return WallSampler(motion, spacing, smooth_angle=smooth_angle).at(t)
 
@@ -93,8 +91,9 @@ def _cut(surface: Surface, spacing: float) -> tuple[np.ndarray, np.ndarray]:
         place = (number + 0.5) / pieces[owner]
         return owner, np.stack([1 - place, place], axis=1)
     sides = np.stack([corner[:, (k + 1) % 3] - corner[:, k] for k in range(3)], axis=1)
-    # A triangle of side s has the area 0.43 s^2: about 1.5 spacings a side make one point per spacing^2.
-    cuts = np.maximum(np.ceil(np.sqrt((sides**2).sum(2)).max(1) / (1.5 * spacing) - 0.1), 1).astype(np.int64)
+    # A triangle of side s has the area 0.43 s^2: about 1.8 spacings on the longest side leave no place
+    # farther than a spacing from a point.
+    cuts = np.maximum(np.ceil(np.sqrt((sides**2).sum(2)).max(1) / (1.8 * spacing) - 0.1), 1).astype(np.int64)
     owner, weights = [], []
     for n in np.unique(cuts):
         faces, piece = np.flatnonzero(cuts == n), sub_triangles(int(n))
@@ -117,3 +116,23 @@ def _gather(surface: Surface, owner: np.ndarray, weights: np.ndarray, spacing: f
     single = np.where(small, -1, np.arange(len(owner)))
     key = np.column_stack([np.where(small[:, None], box, 0), facing, surface.region[owner], single])
     return np.unique(key, axis=0, return_inverse=True)[1].reshape(-1)
+
+
+def _corner_blend(surface: Surface, cosine: float) -> csr_array:
+    """The map `(nf * D, nf)` from normals of faces to normals of corners, over faces at a small angle."""
+    dimension, count = surface.dimension, len(surface.faces)
+    vertex = surface.faces.ravel()
+    order = np.argsort(vertex, kind="stable")
+    around = np.bincount(vertex, minlength=len(surface.vertices))
+    first = np.cumsum(around) - around
+    corner, place = repeated(around[vertex])
+    other = order[first[vertex[corner]] + place]
+    face, neighbour = corner // dimension, other // dimension
+    close = (surface.normals[face] * surface.normals[neighbour]).sum(axis=1) > cosine
+    close |= face == neighbour
+    angle = np.stack(surface.corner_angles(), axis=1).ravel()[other]
+    return _sparse(angle[close], corner[close], neighbour[close], (count * dimension, count))
+
+
+def _sparse(values: np.ndarray, rows: np.ndarray, columns: np.ndarray, shape: tuple[int, int]) -> csr_array:
+    return csr_array(coo_array((values.ravel(), (rows.ravel(), columns.ravel())), shape=shape))

@@ -83,7 +83,7 @@ def test_contains_agrees_with_the_mesh_and_the_mask() -> None:
     volume = recording.mask.sum(axis=(1, 2, 3)) * recording.grid.cell_volume
     np.testing.assert_allclose(volume, recording.volume, rtol=0.1)
     surface = shape.surface(0.8e-3, 0.1)
-    points = np.random.default_rng(0).uniform(-0.01, 0.002, (500, 3)) * np.array([1, 1, 3])
+    points = np.random.default_rng(0).uniform(-0.01, 0.002, (150, 3)) * np.array([1, 1, 3])
     clear = SurfaceIndex(surface).query(points).distance > 5e-5
     inside = winding_number(surface.vertices, surface.faces, points[clear]) > 0.5
     np.testing.assert_array_equal(inside, shape.contains(points[clear], 0.1))
