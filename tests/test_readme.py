@@ -76,4 +76,4 @@ def test_the_example_runs(tmp_path, monkeypatch):
     exec(compile(example, "README.md", "exec"), names)
     written = names["geometry"].read_recording(tmp_path / "analysis.h5")
     assert written.frames == 2
-    assert written.velocity == pytest.approx(names["analysis"].velocity)
+    assert written.velocity == pytest.approx(names["analysis"].recording.velocity)
