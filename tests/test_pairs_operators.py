@@ -33,12 +33,13 @@ class TestOperators:
 
     def test_search(self):
         state = disordered(5, 3, torch.float32)
-        arguments = (state.position, state.member, 2.4, [float("inf")] * 3)
-        torch.library.opcheck(operators.cluster_lists, arguments, test_utils=("test_schema",))
+        entries = torch.empty(9000, dtype=torch.int32)
+        arguments = (state.position, state.member, 2.4, [float("inf")] * 3, entries)
+        torch.library.opcheck(operators.cluster_lists, arguments, test_utils=self.checks)
 
     def test_pass(self):
         state = disordered(5, 3, torch.float32)
-        lists = operators.cluster_lists(state.position, state.member, 2.4, [float("inf")] * 3)
+        lists = backend("cpu").search(state.position, state.member, 2.4).lists
         terms = operators.CONTINUITY | operators.CONCENTRATION | operators.PRESSURE
         coefficients = torch.tensor([[1.2, 0.0, 0.0, 0.0]], dtype=torch.float64)
         arrays = (state.position, state.velocity, state.mass, state.deviation, state.pressure, None, None)
@@ -72,7 +73,7 @@ class TestOperators:
 
     def test_combination_that_is_not_compiled(self):
         state = disordered(4, 3)
-        lists = operators.cluster_lists(state.position, state.member, 2.4, [float("inf")] * 3)
+        lists = backend("cpu").search(state.position, state.member, 2.4).lists
         coefficients = torch.ones((1, 4), dtype=torch.float64)
         arrays = (state.position, state.velocity, state.mass, state.deviation, None, None, None)
         terms = operators.SHEPARD | operators.CONTINUITY

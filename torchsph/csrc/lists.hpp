@@ -6,60 +6,73 @@
 #include <atomic>
 
 #include "columns.hpp"
+#include "compaction.hpp"
 
 namespace sph {
 
 constexpr std::int32_t list_end = -1;
 
-template <class Real, int D> struct Reach {  // the particles a of one cluster, in one periodic image
-  Real lane[3][cluster_size];
-  double least[3], most[3];
-
-  Reach(const Columns<Real>& c, std::int64_t cluster, int image, const double* period)
-      : Reach(c.at, cluster * cluster_size, image, period) {}
+// The particles a of one cluster in one periodic image, relative to their middle.
+template <class Real, int D> struct Reach {
+  Real middle[D], twice[D][cluster_size], square[cluster_size];  // 2 a and |a|^2
+  double least[D], most[D];
 
   Reach(const std::vector<Real>* at, std::int64_t first, int image, const double* period) {
+    Real lane[D][cluster_size];
     for (int d = 0; d < D; ++d) {
       const int step = image_step(image, d);
       const Real move = step ? Real(step * period[d]) : Real(0);
-      least[d] = std::numeric_limits<double>::max();
-      most[d] = std::numeric_limits<double>::lowest();
-      for (int l = 0; l < cluster_size; ++l) {
-        lane[d][l] = at[d][first + l] + move;
-        least[d] = std::min(least[d], double(lane[d][l]));
-        most[d] = std::max(most[d], double(lane[d][l]));
+      for (int l = 0; l < cluster_size; ++l) lane[d][l] = at[d][first + l] + move;
+      Real low = lane[d][0], high = lane[d][0];
+      for (int l = 1; l < cluster_size; ++l) {
+        low = std::min(low, lane[d][l]);
+        high = std::max(high, lane[d][l]);
+      }
+      least[d] = low;
+      most[d] = high;
+      middle[d] = Real(0.5) * (low + high);
+    }
+    for (int l = 0; l < cluster_size; ++l) {
+      square[l] = 0;
+      for (int d = 0; d < D; ++d) {
+        const Real a = lane[d][l] - middle[d];
+        twice[d][l] = 2 * a;
+        square[l] += a * a;
       }
     }
   }
+
+  // Rounding of |a|^2 - 2 a.b + |b|^2 must not lose a neighbour: squares that the radius is raised by.
+  Real allowance(Real radius) const {
+    Real wide = radius;
+    for (int d = 0; d < D; ++d) wide += Real(most[d] - least[d]);
+    return 16 * std::numeric_limits<Real>::epsilon() * wide * wide;
+  }
 };
 
-// Append the slots of [first, last) closer than the root of `reach2` to any of the 8 lanes.
+// Append the slots of [first, last) closer than the root of `reach2` to any of the 8 particles a.
 template <class Real, int D>
 SPH_INLINE void sift(const Columns<Real>& c, const Reach<Real, D>& a, std::int64_t first, std::int64_t last, Real reach2,
                      std::vector<std::int32_t>& out, std::size_t& size) {
   using L = Lanes<Real>;
-  if (out.size() < size + std::size_t(last - first) + L::count) out.resize(2 * (size + std::size_t(last - first) + L::count));
-  std::int32_t* to = out.data();
-  std::size_t n = size;
+  using V = typename L::Vector;
+  const std::size_t room = size + std::size_t(last - first) + L::count;
+  if (out.size() < room) out.resize(2 * room);
+  std::int32_t* to = out.data() + size;
   for (std::int64_t j = first; j < last; j += L::count) {
-    typename L::Vector x[D], nearest{};
-    for (int d = 0; d < D; ++d) x[d] = L::load(c.at[d].data() + j);
+    V b[D], square{}, least;  // least over a of |a|^2 - 2 a.b = r^2 - |b|^2
+    for (int d = 0; d < D; ++d) {
+      b[d] = L::load(c.at[d].data() + j) - a.middle[d];
+      square += b[d] * b[d];
+    }
     for (int l = 0; l < cluster_size; ++l) {
-      typename L::Vector square{};
-      for (int d = 0; d < D; ++d) {
-        const typename L::Vector gap = x[d] - a.lane[d][l];
-        square += gap * gap;
-      }
-      nearest = l ? smaller(nearest, square) : square;
+      V part = L::all(a.square[l]);
+      for (int d = 0; d < D; ++d) part -= a.twice[d][l] * b[d];
+      least = l ? smaller(least, part) : part;
     }
-    const typename L::Mask close = nearest < reach2;
-    const int here = int(std::min<std::int64_t>(L::count, last - j));
-    for (int l = 0; l < here; ++l) {
-      to[n] = std::int32_t(j + l);
-      n -= std::size_t(std::ptrdiff_t(close[l]));
-    }
+    to += append_below<Real>(to, std::int32_t(j), int(std::min<std::int64_t>(L::count, last - j)), least, reach2 - square);
   }
-  size = n;
+  size = std::size_t(to - out.data());
 }
 
 // All slots of the member's columns within reach of the cluster.
@@ -73,6 +86,7 @@ void gather(const Columns<Real>& c, std::int64_t member, const Reach<Real, D>& a
   const auto apart = [&](int axis, std::int64_t k) {
     return std::max(0.0, std::max(box.left(axis, k) - a.most[axis], a.least[axis] - box.right(axis, k)));
   };
+  const Real reach2 = Real(radius * radius) + a.allowance(Real(radius));
   const std::int64_t z0 = D == 3 ? box.cell(2, a.least[2] - reach) : 0, z1 = D == 3 ? box.cell(2, a.most[2] + reach) : 0;
   const std::int64_t y0 = box.cell(1, a.least[1] - reach), y1 = box.cell(1, a.most[1] + reach);
   for (std::int64_t z = z0; z <= z1; ++z) {
@@ -85,7 +99,7 @@ void gather(const Columns<Real>& c, std::int64_t member, const Reach<Real, D>& a
       const std::int64_t shift = c.shift[c.first_column[member] + column];
       const std::int64_t first = c.start[bin + box.cell(0, a.least[0] - along)] + shift;
       const std::int64_t last = c.start[bin + box.cell(0, a.most[0] + along) + 1] + shift;
-      sift<Real, D>(c, a, first, last, Real(radius * radius), out, size);
+      sift<Real, D>(c, a, first, last, reach2, out, size);
     }
   }
 }

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import weakref
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -26,6 +28,8 @@ from .native import library
 # the order of sph::Kernel in csrc/smoothing.hpp
 _KERNELS = ("wendland_c2", "wendland_c4", "wendland_c6", "cubic", "quintic", "gaussian", "spiky")
 _BY_VOLUME, _BY_MASS = 0, 1
+# buffers of lists that nobody holds any more; a few, so that memory is given back
+_SPARE: deque[Tensor] = deque(maxlen=4)
 
 
 @dataclass(frozen=True)
@@ -64,6 +68,7 @@ class CpuBackend(Backend):
 
     def __init__(self) -> None:
         self.instruction_set = library().instruction_set
+        self.entries_per_particle = 40.0  # of the last search; the first guess
 
     def search(
         self,
@@ -77,10 +82,27 @@ class CpuBackend(Backend):
         _check_reals(position)
         length = _lengths(period, position.shape[1])
         check_search(None, radius + margin, period)
-        lists = operators.cluster_lists(
-            position.detach().contiguous(), member.contiguous(), radius + margin, length
-        )
-        return ClusterPairs(lists, length, position.shape[0])
+        entries = self._room(int(1.1 * self.entries_per_particle * position.shape[0]) + 64)
+        while True:
+            slot, owner, offset, home, needed = operators.cluster_lists(
+                position.detach().contiguous(), member.contiguous(), radius + margin, length, entries
+            )
+            if int(needed) <= entries.numel():
+                break
+            entries = self._room(int(1.1 * int(needed)))
+        self.entries_per_particle = int(needed) / max(position.shape[0], 1)
+        pairs = ClusterPairs([slot, owner, entries, offset, home], length, position.shape[0])
+        weakref.finalize(pairs, _SPARE.append, entries).atexit = False
+        return pairs
+
+    @staticmethod
+    def _room(entries: int) -> Tensor:
+        """An int32 buffer that no pairs use any more, or a new one: fresh pages cost as much as a search."""
+        while _SPARE:
+            spare = _SPARE.pop()
+            if entries <= spare.numel() <= 4 * entries:
+                return spare
+        return torch.empty(entries, dtype=torch.int32)
 
     def rates(self, pairs: ClusterPairs, state: PairState, support: Support, terms: RateTerms) -> Rates:
         run = _Passes(pairs, state, support)

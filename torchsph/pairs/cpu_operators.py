@@ -34,9 +34,6 @@ _OUTPUTS: tuple[tuple[int, str, int], ...] = (
 )
 _REALS = {torch.float32: "f32", torch.float64: "f64"}
 
-# entries per cluster of the last search: the next one allocates a little more, and repeats if it must
-_entries_per_cluster = 200.0
-
 
 def output_names(terms: int) -> list[str]:
     """Names of the sums that ``pair_pass`` returns for ``terms``, in order."""
@@ -56,28 +53,22 @@ def _period(period: Sequence[float]) -> ctypes.Array:
     return (ctypes.c_double * 3)(*period, *(float("inf"),) * (3 - len(period)))
 
 
-@torch.library.custom_op("torchsph::cluster_lists", mutates_args=(), device_types="cpu")
-def cluster_lists(position: Tensor, member: Tensor, radius: float, period: Sequence[float]) -> list[Tensor]:
-    """Sort particles into clusters and list their neighbours.
+@torch.library.custom_op("torchsph::cluster_lists", mutates_args=("entries",), device_types="cpu")
+def cluster_lists(
+    position: Tensor, member: Tensor, radius: float, period: Sequence[float], entries: Tensor
+) -> list[Tensor]:
+    """Sort particles into clusters and write the lists of their neighbours into ``entries``, int32.
 
     Returns:
-        slot (S,), owner (C,), entries (E,) int32; offset (C,) int64; home (S, D), or (0, D) where no
-        axis is periodic.
+        slot (S,), owner (C,) int32; offset (C,) int64; home (S, D), or (0, D) where no axis is periodic;
+        needed (1,) int64. Where ``needed`` exceeds the length of ``entries`` the lists are incomplete: call
+        again with more room.
 
     Raises:
         ValueError: a position is not finite, or a member index is negative.
     """
-    global _entries_per_cluster
     reals, code = _REALS[position.dtype], library()
-    given = SearchArguments(
-        position.shape[0],
-        position.data_ptr(),
-        member.data_ptr(),
-        radius,
-        _period(period),
-        position.shape[1],
-        torch.get_num_threads(),
-    )
+    given = _search_arguments(position, member, radius, period)
     sizes = Sizes()
     code.function("sort", reals)(ctypes.byref(given), ctypes.byref(sizes))
     if sizes.unusable:
@@ -88,29 +79,38 @@ def cluster_lists(position: Tensor, member: Tensor, radius: float, period: Seque
     slots, clusters = CLUSTER * sizes.clusters, sizes.clusters
     periodic = any(length != float("inf") for length in period)
     slot, owner = torch.empty(slots, dtype=torch.int32), torch.empty(clusters, dtype=torch.int32)
-    offset = torch.empty(clusters, dtype=torch.int64)
+    offset, needed = torch.empty(clusters, dtype=torch.int64), torch.empty(1, dtype=torch.int64)
     home = position.new_empty((slots if periodic else 0, position.shape[1]))
-    capacity = 0
-    needed = int(1.1 * _entries_per_cluster * clusters) + 64
-    while needed > capacity:
-        capacity = needed
-        entries = torch.empty(capacity, dtype=torch.int32)
-        lists = ListArguments(
-            *(t.data_ptr() for t in (slot, owner, offset, entries)), home.data_ptr() if periodic else None
-        )
-        needed = code.function("list", reals)(ctypes.byref(given), capacity, ctypes.byref(lists))
-    _entries_per_cluster = needed / max(clusters, 1)
-    return [slot, owner, entries, offset, home]
+    addresses = (t.data_ptr() for t in (slot, owner, offset, entries))
+    lists = ListArguments(*addresses, home.data_ptr() if periodic else None)
+    needed[0] = code.function("list", reals)(ctypes.byref(given), entries.numel(), ctypes.byref(lists))
+    return [slot, owner, offset, home, needed]
 
 
 @cluster_lists.register_fake
-def _(position: Tensor, member: Tensor, radius: float, period: Sequence[float]) -> list[Tensor]:
-    context = torch.library.get_ctx()
-    clusters, entries = context.new_dynamic_size(), context.new_dynamic_size()
-    whole = [position.new_empty(size, dtype=torch.int32) for size in (CLUSTER * clusters, clusters, entries)]
+def _(
+    position: Tensor, member: Tensor, radius: float, period: Sequence[float], entries: Tensor
+) -> list[Tensor]:
+    clusters = torch.library.get_ctx().new_dynamic_size()
+    slot, owner = (position.new_empty(size, dtype=torch.int32) for size in (CLUSTER * clusters, clusters))
+    offset, needed = (position.new_empty(size, dtype=torch.int64) for size in (clusters, 1))
     periodic = any(length != float("inf") for length in period)
     home = position.new_empty((CLUSTER * clusters if periodic else 0, position.shape[1]))
-    return [*whole, position.new_empty(clusters, dtype=torch.int64), home]
+    return [slot, owner, offset, home, needed]
+
+
+def _search_arguments(
+    position: Tensor, member: Tensor, radius: float, period: Sequence[float]
+) -> SearchArguments:
+    return SearchArguments(
+        position.shape[0],
+        position.data_ptr(),
+        member.data_ptr(),
+        radius,
+        _period(period),
+        position.shape[1],
+        torch.get_num_threads(),
+    )
 
 
 @torch.library.custom_op("torchsph::pair_pass", mutates_args=(), device_types="cpu")
@@ -131,7 +131,7 @@ def pair_pass(
     """One pass over the cluster lists.
 
     Args:
-        lists: what ``cluster_lists`` returned. period: (D,), inf where not periodic.
+        lists: slot, owner, entries, offset, home of ``cluster_lists``. period: (D,), inf where not periodic.
         choice: terms, weight, pressure form and kernel of csrc/rows.hpp and csrc/smoothing.hpp.
         kernel: support in smoothing lengths and sigma_D. coefficients: (members, 4) float64.
 
@@ -210,15 +210,7 @@ def interpolation_moments(
     Raises:
         ValueError: a position is not finite, or a member index is negative.
     """
-    given = SearchArguments(
-        position.shape[0],
-        position.data_ptr(),
-        member.data_ptr(),
-        radius,
-        _period(period),
-        position.shape[1],
-        torch.get_num_threads(),
-    )
+    given = _search_arguments(position, member, radius, period)
     outputs = _allocate_moments(fields, query)
     arguments = InterpolationArguments(
         given,
