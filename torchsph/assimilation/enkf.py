@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from .filters import EnsembleFilter, GlobalTransform, Transform
+from .filters import EnsembleFilter, GlobalTransform, Target, Transform
 from .observations import Observations, Screened
 from .rotation import need_generator
 from .subspace import update_solution, zero_sum_basis
@@ -26,7 +26,7 @@ class StochasticEnKF(EnsembleFilter):
         anomalies: Tensor,
         screened: Screened,
         observations: Observations,
-        state: tuple[int, Tensor | None],
+        target: Target,
         generator: torch.Generator | None,
     ) -> tuple[Transform, Tensor, Tensor]:
         draw = need_generator(generator, "the stochastic filter")

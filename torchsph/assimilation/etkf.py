@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from .filters import EnsembleFilter, GlobalTransform, Transform
+from .filters import EnsembleFilter, GlobalTransform, Target, Transform
 from .observations import Observations, Screened
 from .subspace import update_weights, zero_sum_basis
 
@@ -26,7 +26,7 @@ class ETKF(EnsembleFilter):
         anomalies: Tensor,
         screened: Screened,
         observations: Observations,
-        state: tuple[int, Tensor | None],
+        target: Target,
         generator: torch.Generator | None,
     ) -> tuple[Transform, Tensor, Tensor]:
         size = anomalies.shape[-2]

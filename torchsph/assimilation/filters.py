@@ -116,6 +116,15 @@ class GlobalTransform:
         return self.matrix[..., rows, :].mT @ members.double()
 
 
+@dataclass(frozen=True)
+class Target:
+    """The state that an analysis is for: n numbers, their positions `(q, D)` if known, their precision."""
+
+    size: int
+    positions: Tensor | None
+    dtype: torch.dtype
+
+
 @dataclass(frozen=True, kw_only=True)
 class EnsembleFilter(ABC):
     """Screening, inflation, rotation and record keeping around a method's `_transform`.
@@ -140,14 +149,14 @@ class EnsembleFilter(ABC):
         anomalies: Tensor,
         screened: Screened,
         observations: Observations,
-        state: tuple[int, Tensor | None],
+        target: Target,
         generator: torch.Generator | None,
     ) -> tuple[Transform, Tensor, Tensor]:
         """The map, the signal's degrees of freedom and the reason codes.
 
         Args:
             anomalies: `(*batch, N, m)` predicted observations less their mean, zero where not used.
-            state: number of state variables and their positions.
+            target: what the map will be applied to.
         """
 
     def analyse(
@@ -169,8 +178,8 @@ class EnsembleFilter(ABC):
             factor = factor * part.prior_factor(screened)
         anomalies = (wide - mean.unsqueeze(-2)) * _column(factor, 2)
         anomalies = torch.where(screened.used.unsqueeze(-2), anomalies, 0.0)
-        state = (ensemble.shape[-1], state_positions)
-        transform, signal, reason = self._transform(anomalies, screened, observations, state, generator)
+        target = Target(ensemble.shape[-1], state_positions, ensemble.dtype)
+        transform, signal, reason = self._transform(anomalies, screened, observations, target, generator)
         rotation = self._rotation(ensemble, generator)
         analysed = self._finish(ensemble, factor, transform, rotation)
         variance = self._variance(analysed)

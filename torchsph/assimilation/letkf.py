@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from .errors import AssimilationError
-from .filters import EnsembleFilter, Transform
+from .filters import EnsembleFilter, Target, Transform
+from .local_sums import LocalSums
 from .localisation import Groups, Localisation, PatchGrid
 from .observations import Observations, Reason, Screened
 from .subspace import update_weights, zero_sum_basis
@@ -17,18 +18,19 @@ from .subspace import update_weights, zero_sum_basis
 
 @dataclass(frozen=True, kw_only=True)
 class LETKF(EnsembleFilter):
-    """Hunt, Kostelich & Szunyogh (2007), Physica D 230, with observation-error localisation.
+    """Hunt, Kostelich & Szunyogh (2007), Physica D 230, with the taper on the inverse observation errors.
 
     Attributes:
         localisation: radius and periodicity.
-        patch: spacing of the local analyses as a fraction of the radius. Their weights are interpolated to
-            the state's places (Yang et al. 2009, QJRMS 135, 251: without loss up to about the radius' half),
-            and the taper is interpolated between the same nodes, so that each observation's outer product is
-            formed once and not once per patch. None: one exact analysis per place, for small states.
+        patch: spacing of the local analyses as a fraction of the radius; their weights are interpolated to
+        the
+            state's places (Yang et al. 2009, QJRMS 135, 251). On a ventricle of 6400 nodes with short error
+            scales, a fifth cost 2 % of analysis error, a quarter 3 % and a half 11 % against exact analyses.
+            None: one analysis at each place, exact.
     """
 
     localisation: Localisation
-    patch: float | None = 0.25
+    patch: float | None = 0.2
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -40,136 +42,88 @@ class LETKF(EnsembleFilter):
         anomalies: Tensor,
         screened: Screened,
         observations: Observations,
-        state: tuple[int, Tensor | None],
+        target: Target,
         generator: torch.Generator | None,
     ) -> tuple[Transform, Tensor, Tensor]:
-        layout = self._layout(*state, observations)
-        basis = zero_sum_basis(anomalies.shape[-2], device=anomalies.device)
-        modes = (anomalies.mT @ basis).contiguous()  # (*batch, m, r): rows are gathered
-        gram, projected, informed = layout.normal_equations(modes, screened)
+        located = _located(target, observations)
         size = anomalies.shape[-2]
+        basis = zero_sum_basis(size, device=anomalies.device)
+        if self.localisation.off or not len(observations):
+            transform = _nothing(located, basis, anomalies.shape[:-2])
+            used = screened.reason == Reason.USED
+            reason = torch.where(used, int(Reason.OUT_OF_REACH), screened.reason).to(torch.uint8)
+            return transform, torch.zeros(anomalies.shape[:-2], dtype=torch.float64), reason
+        places, groups = self._places(target, located)
+        there = self.localisation.scaled(observations.places)
+        sums = LocalSums.of(anomalies.mT @ basis, screened, there, self.localisation, target.dtype)
         prior = (size - 1) * torch.eye(size - 1, dtype=torch.float64, device=anomalies.device)
-        shift, root, signal = update_weights(prior, gram, projected)
-        weights = shift.unsqueeze(-1) + (size - 1) ** 0.5 * (root @ basis.mT)
-        number = informed.sum(-1).clamp(min=1)
-        signal = torch.where(informed, signal, 0.0).sum(-1) / number
-        far = (screened.reason == Reason.USED) & ~layout.useful
+        weights, informed, signals = [], [], []
+        for part in sums.parts(places):
+            gram, projected, amount = sums.at(places[part])
+            shift, root, signal = update_weights(prior, gram, projected)
+            local = shift.unsqueeze(-1) + (size - 1) ** 0.5 * (root @ basis.mT)
+            weights.append(local.to(target.dtype))
+            informed.append(amount > 0)
+            signals.append(signal)
+        some = torch.cat(informed, -1)
+        transform = LocalTransform.of(torch.cat(weights, -3), some, groups, located, basis)
+        number = some.sum(-1).clamp(min=1)
+        mean_signal = torch.where(some, torch.cat(signals, -1), 0.0).sum(-1) / number
+        far = (screened.reason == Reason.USED) & ~sums.useful
         reason = torch.where(far, int(Reason.OUT_OF_REACH), screened.reason).to(torch.uint8)
-        return LocalTransform.of(weights, informed, layout, basis), signal, reason
+        return transform, mean_signal, reason
 
-    def _layout(self, size: int, positions: Tensor | None, observations: Observations) -> _Layout:
-        if positions is None or observations.position is None:
-            raise AssimilationError(
-                "the LETKF needs places: pass state_positions=... and Observations(position=...)"
-            )
-        if not len(positions) or size % len(positions):
-            raise AssimilationError(f"{len(positions)} state positions do not divide a state of {size}")
-        places = positions.repeat(size // len(positions), 1)
-        located = torch.isfinite(places).all(-1)
-        if not bool(located.any()):
-            raise AssimilationError("no state variable has a finite position")
-        if self.localisation.off:
-            return _Layout.without_observations(located, len(observations))
-        here, there = self.localisation.scaled(places[located]), self.localisation.scaled(observations.places)
+    def _places(self, target: Target, located: Tensor) -> tuple[Tensor, Groups]:
+        """Scaled places `(P, D)` of the local analyses, and which state variables share in which of them."""
         index = torch.nonzero(located).squeeze(-1)
+        here = self.localisation.scaled(_spread_out(target)[index])
         if self.patch is None:
-            return _exact_layout(self.localisation, here, there, index, located)
-        return _patch_layout(self.localisation, self.patch, here, there, index, located)
+            places, which = torch.unique(here, dim=0, return_inverse=True)
+            one = torch.ones(len(index), dtype=torch.float64, device=here.device)
+            return places, Groups.of(which, index, one)
+        period = self.localisation.scaled_period(here.shape[-1], here.device)
+        grid = PatchGrid.around(here, self.patch, period)
+        node, weight = grid.share(here)
+        groups = Groups.of(node.flatten(), index.repeat_interleave(node.shape[-1]), weight.flatten())
+        return grid.nodes(groups.patch), groups
 
 
-@dataclass(frozen=True)
-class _Layout:
-    """Which observations and state variables belong to which of P patches.
-
-    `state` and `observed` group numbers by patch and by bin; `taper (P, bins)` joins the two, None where
-    bins are the patches themselves. `useful (m,)`: observation within reach of any patch; `located (n,)`.
-    """
-
-    state: Groups
-    observed: Groups
-    taper: Tensor | None
-    useful: Tensor
-    located: Tensor
-
-    @classmethod
-    def without_observations(cls, located: Tensor, count: int) -> _Layout:
-        index = torch.nonzero(located).squeeze(-1)
-        one = torch.ones(len(index), dtype=torch.float64, device=located.device)
-        empty = Groups(index[:1] * 0, index[:0].reshape(1, 0), one[:0].reshape(1, 0))
-        useful = torch.zeros(count, dtype=torch.bool, device=located.device)
-        return cls(Groups.of(index * 0, index, one), empty, None, useful, located)
-
-    def normal_equations(self, modes: Tensor, screened: Screened) -> tuple[Tensor, Tensor, Tensor]:
-        """Gram `(*batch, P, r, r)`, right side `(*batch, P, r)`, and whether `(*batch, P)` has any data."""
-        grams, sides, amounts = [], [], []
-        numbers = math.prod(modes.shape[:-2]) * modes.shape[-1]
-        for part in self.observed.chunks(numbers):
-            item, share = self.observed.item[part], self.observed.weight[part]
-            weight = screened.weight[..., item] * share  # (*batch, p, K)
-            local = modes[..., item, :]  # (*batch, p, K, r)
-            weighted = local * weight.unsqueeze(-1)
-            grams.append(weighted.mT @ local)
-            sides.append((weighted * screened.innovation[..., item].unsqueeze(-1)).sum(-2))
-            amounts.append(weight.sum(-1))
-        gram, side, amount = torch.cat(grams, -3), torch.cat(sides, -2), torch.cat(amounts, -1)
-        if self.taper is not None:
-            gram = (self.taper @ gram.flatten(-2)).unflatten(-1, gram.shape[-2:])
-            side = self.taper @ side
-            amount = (self.taper @ amount.unsqueeze(-1)).squeeze(-1)
-        return gram, side, amount > 0
+def _located(target: Target, observations: Observations) -> Tensor:
+    """`(n,)` which state variables have a place; raises where places are missing altogether."""
+    if target.positions is None or observations.position is None:
+        raise AssimilationError(
+            "the LETKF needs places: pass state_positions=... and Observations(position=...)"
+        )
+    if not len(target.positions) or target.size % len(target.positions):
+        raise AssimilationError(
+            f"{len(target.positions)} state positions do not divide a state of {target.size}"
+        )
+    located = torch.isfinite(_spread_out(target)).all(-1)
+    if not bool(located.any()):
+        raise AssimilationError("no state variable has a finite position")
+    return located
 
 
-def _exact_layout(
-    localisation: Localisation, here: Tensor, there: Tensor, index: Tensor, located: Tensor
-) -> _Layout:
-    """One patch per distinct place; its observations carry the exact taper."""
-    places, which = torch.unique(here, dim=0, return_inverse=True)
-    one = torch.ones(len(index), dtype=torch.float64, device=here.device)
-    step = max(1, 4_000_000 // max(1, len(there) * here.shape[-1]))
-    pairs = [localisation.taper(part, there).to_sparse() for part in places.split(step)]
-    patch = torch.cat([part.indices()[0] + step * k for k, part in enumerate(pairs)])
-    item = torch.cat([part.indices()[1] for part in pairs])
-    groups = _complete(Groups.of(patch, item, torch.cat([part.values() for part in pairs])), len(places))
-    useful = torch.zeros(len(there), dtype=torch.bool, device=here.device)
-    useful[item] = True
-    return _Layout(Groups.of(which, index, one), groups, None, useful, located)
+def _spread_out(target: Target) -> Tensor:
+    """`(n, D)` position of each number of the state."""
+    return target.positions.repeat(target.size // len(target.positions), 1)
 
 
-def _complete(groups: Groups, count: int) -> Groups:
-    """The same groups with empty rows for the patches that have no items."""
-    item = groups.item.new_zeros(count, groups.item.shape[1])
-    weight = groups.weight.new_zeros(count, groups.item.shape[1])
-    item[groups.patch], weight[groups.patch] = groups.item, groups.weight
-    return Groups(torch.arange(count, device=item.device), item, weight)
-
-
-def _patch_layout(
-    localisation: Localisation, spacing: float, here: Tensor, there: Tensor, index: Tensor, located: Tensor
-) -> _Layout:
-    """Patches and bins on one coarse grid, each with multilinear shares, joined by the taper."""
-    period = localisation.scaled_period(here.shape[-1], here.device)
-    grid = PatchGrid.around(torch.cat([here, there]), spacing, period)
-    state = _shared(grid, here, index)
-    numbers = torch.arange(len(there), device=here.device)
-    observed = _shared(grid, there, numbers)
-    taper = localisation.taper(grid.nodes(state.patch), grid.nodes(observed.patch))
-    useful = torch.zeros(len(there), dtype=torch.bool, device=here.device)
-    touched = (taper > 0).any(0).unsqueeze(-1) & (observed.weight > 0)
-    useful[observed.item[touched]] = True
-    return _Layout(state, observed, taper, useful, located)
-
-
-def _shared(grid: PatchGrid, points: Tensor, index: Tensor) -> Groups:
-    node, weight = grid.share(points)
-    return Groups.of(node.flatten(), index.repeat_interleave(node.shape[-1]), weight.flatten())
+def _nothing(located: Tensor, basis: Tensor, batch: torch.Size) -> LocalTransform:
+    """The transform that leaves every member as it is."""
+    index = torch.nonzero(located).squeeze(-1)
+    one = torch.ones(len(index), dtype=torch.float64, device=located.device)
+    same = basis.mT.expand(*batch, 1, *basis.mT.shape)
+    none = torch.zeros(*batch, 1, dtype=torch.bool, device=located.device)
+    return LocalTransform.of(same, none, Groups.of(index * 0, index, one), located, basis)
 
 
 @dataclass(frozen=True)
 class LocalTransform:
-    """Weights `(*batch, P, r, N)` of the members at P patches, shared out to the state by `state`.
+    """Weights `(*batch, P, r, N)` of the members at P places, shared out to the state by `state`.
 
-    Numbers without a place (parameters) take the average weights of the patches that have observations, the
-    spatial averaging of Aksoy, Zhang & Nielsen-Gammon (2006).
+    Numbers without a place (parameters) take the `average` weights `(*batch, r, N)` of the places that have
+    observations, the spatial averaging of Aksoy, Zhang & Nielsen-Gammon (2006).
     """
 
     weights: Tensor
@@ -180,15 +134,18 @@ class LocalTransform:
     reached: Tensor | None
 
     @classmethod
-    def of(cls, weights: Tensor, informed: Tensor, layout: _Layout, basis: Tensor) -> LocalTransform:
+    def of(
+        cls, weights: Tensor, informed: Tensor, state: Groups, located: Tensor, basis: Tensor
+    ) -> LocalTransform:
+        """With `informed (*batch, P)` marking the places that any observation reaches."""
         number = informed.sum(-1).clamp(min=1)[..., None, None]
         average = torch.where(informed[..., None, None], weights, 0.0).sum(-3) / number
-        reached = torch.zeros(*informed.shape[:-1], len(layout.located), device=weights.device)
-        hit = informed.unsqueeze(-1) & (layout.state.weight > 0)
-        flat = layout.state.item.flatten().expand(*informed.shape[:-1], -1)
+        reached = torch.zeros(*informed.shape[:-1], len(located), device=weights.device)
+        hit = informed.unsqueeze(-1) & (state.weight > 0)
+        flat = state.item.flatten().expand(*informed.shape[:-1], -1)
         reached = reached.scatter_add(-1, flat, hit.flatten(-2).to(reached)) > 0
-        reached = reached | (informed.any(-1, keepdim=True) & ~layout.located)
-        return cls(weights, average, layout.state, layout.located, basis, reached.unsqueeze(-2))
+        reached = reached | (informed.any(-1, keepdim=True) & ~located)
+        return cls(weights, average, state, located, basis, reached.unsqueeze(-2))
 
     def apply(self, ensemble: Tensor) -> Tensor:
         """See `Transform.apply`."""

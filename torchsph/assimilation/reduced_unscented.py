@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from .errors import AssimilationError
-from .filters import Analysis, EnsembleFilter, GlobalTransform, Transform, check_ensemble
+from .filters import Analysis, EnsembleFilter, GlobalTransform, Target, Transform, check_ensemble
 from .observations import Observations, Screened
 from .sigma import SigmaPoints, Simplex
 from .subspace import update_weights
@@ -82,7 +82,7 @@ class ReducedUnscented(EnsembleFilter):
         anomalies: Tensor,
         screened: Screened,
         observations: Observations,
-        state: tuple[int, Tensor | None],
+        target: Target,
         generator: torch.Generator | None,
     ) -> tuple[Transform, Tensor, Tensor]:
         weight, coordinate, project = self._rule(anomalies)
