@@ -96,10 +96,11 @@ class Stepper:
 
     def step(
         self, particles: Particles, step: Tensor, number: int, around: Surroundings
-    ) -> tuple[Particles, Tensor]:
+    ) -> tuple[Particles, Tensor, WallSample | None]:
         """Advance every member by its own ``step`` (members,), internal time; ``number`` counts the steps.
 
-        Returns the particles and the acceleration (N, D) of the fluid that the next step's force limit needs.
+        Returns the particles, the acceleration (N, D) of the fluid that the next step's force limit needs, and the
+        walls that the particles saw.
         """
         if self.scheme.order == "thesis":
             return self._thesis_step(particles, step, number, around)
@@ -107,7 +108,7 @@ class Stepper:
 
     def _symplectic_step(
         self, particles: Particles, step: Tensor, number: int, around: Surroundings
-    ) -> tuple[Particles, Tensor]:
+    ) -> tuple[Particles, Tensor, WallSample | None]:
         """Both passes at the same position; velocity first, then position (symplectic Euler)."""
         dt = per_particle(step, particles.member)
         wall = around.sample(particles)
@@ -129,11 +130,11 @@ class Stepper:
                 particles, crowding, step, self.coefficients.smoothing_length, self.scheme.shifting
             )
             drift = drift + torch.where(fluid, shift, 0.0)
-        return particles.changed(position=particles.position + drift), acceleration
+        return particles.changed(position=particles.position + drift), acceleration, wall
 
     def _thesis_step(
         self, particles: Particles, step: Tensor, number: int, around: Surroundings
-    ) -> tuple[Particles, Tensor]:
+    ) -> tuple[Particles, Tensor, WallSample | None]:
         """Algorithm 1 as printed: density and position with p^n, then forces at the new position, then XSPH.
 
         First order where forces depend on velocity or density (errata to algorithm 1); kept as the thesis's scheme.
@@ -160,7 +161,7 @@ class Stepper:
                 particles = particles.changed(velocity=particles.velocity + share * sums.xsph)
             if filtering:
                 particles = particles.changed(deviation=_filtered(particles, sums, dt))
-        return particles, acceleration
+        return particles, acceleration, wall
 
     def _filter_due(self, number: int) -> bool:
         period = self.scheme.shepard_period

@@ -15,7 +15,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .orifice import Orifice, plane_frame, polygon_inset
+from geometry import OrificePlane, orifices
+
 from .particles import FLUID, RESERVOIR, Particles
 from .record import Record
 
@@ -26,6 +27,8 @@ if TYPE_CHECKING:
 _HYSTERESIS = 0.25
 # depth inside the orifice (spacings) at which the profile of an imposed field is read
 _MOUTH = 0.5
+# opening frames kept in memory
+_KEPT_FRAMES = 64
 # samples of dV/dt between key frames; the flux is linear between them
 _FLUX_SAMPLES = 8
 # the ratio of orifice area to the area that the buffer's particles stand for is trusted this far
@@ -42,8 +45,11 @@ class Reservoirs:
         self.flat = domain.scheme.valve.profile == "flat"
         self.length = float(np.ceil(domain.support_radius) + 1.0)
         self.times, self.flux = self._flux_table()
-        self._orifices: dict[tuple[int, int], _Frame] = {}
-        self._was_open: tuple[int, ...] = ()
+        labels = {valve.region: number for number, valve in enumerate(self.valves)}
+        # a region may consist of several openings; each has a buffer of its own
+        self.openings = [one for one in orifices(self.motion) if one.label in labels]
+        self.valve_of = [labels[one.label] for one in self.openings]
+        self._frames: dict[tuple[int, int], _Frame] = {}
 
     def _flux_table(self) -> tuple[np.ndarray, np.ndarray]:
         key = np.asarray(self.motion.time)
@@ -59,30 +65,43 @@ class Reservoirs:
         value = np.interp(times.cpu().numpy(), self.times, self.flux)
         return torch.as_tensor(value, dtype=self.domain.dtype, device=self.domain.device)
 
-    def _frame(self, region: int) -> _Frame:
-        """The orifice of a region in the middle of the present interval (orifices move little within one)."""
+    def frame(self, number: int) -> _Frame:
+        """Opening ``number`` in the middle of the present interval (openings move little within one)."""
         time = self.domain.middle
-        label = (region, int(round(time * 1e7)))
-        if label not in self._orifices:
-            if len(self._orifices) > 64:
-                self._orifices.clear()
-            orifice = Orifice.of(self.motion.surface(time), region)
-            self._orifices[label] = _Frame(orifice, self.units.length, self.domain.dtype, self.domain.device)
-        return self._orifices[label]
+        label = (number, int(round(time * 1e7)))
+        if label not in self._frames:
+            if len(self._frames) > _KEPT_FRAMES:
+                self._frames.clear()
+            plane = self.openings[number].at(time)
+            self._frames[label] = _Frame(plane, self.units.length, self.domain.dtype, self.domain.device)
+        return self._frames[label]
 
-    def _active(self) -> list[tuple[int, int, _Frame]]:
-        """(number, region, orifice) of the open valves."""
+    def _active(self) -> list[tuple[int, _Frame]]:
+        """(number, frame) of the openings of open valves."""
         chosen = self.domain.open_regions
-        return [(n, v.region, self._frame(v.region)) for n, v in enumerate(self.valves) if v.region in chosen]
+        return [(n, self.frame(n)) for n, one in enumerate(self.openings) if one.label in chosen]
+
+    def _flux_through(self, number: int, inflow: Tensor) -> Tensor:
+        """The part of the inflow (members,) that goes through one opening.
+
+        With several valves open at once the cavity fills through the first and empties through the last of them;
+        openings of one region share by area.
+        """
+        regions = sorted(self.domain.open_regions)
+        mine = self.openings[number].label
+        part = inflow.clamp_min(0.0) * (mine == regions[0]) + inflow.clamp_max(0.0) * (mine == regions[-1])
+        total = sum(frame.area for n, frame in self._active() if self.openings[n].label == mine)
+        return part * (self.frame(number).area / total)
 
     def opened(self, particles: Particles) -> Particles:
         """Make the buffers of valves that are open and have none, drop those of valves that have shut."""
-        shut = [RESERVOIR + n for n, v in enumerate(self.valves) if v.region not in self.domain.open_regions]
+        chosen = self.domain.open_regions
+        shut = [RESERVOIR + n for n, one in enumerate(self.openings) if one.label not in chosen]
         if shut:
             kind = torch.tensor(shut, device=particles.kind.device)
             stay = ~torch.isin(particles.kind, kind)
             particles = particles if bool(stay.all()) else particles.select(stay)
-        for number, _, frame in self._active():
+        for number, frame in self._active():
             has = particles.per_member((particles.kind == RESERVOIR + number).to(torch.int64), "sum") > 0
             empty = torch.nonzero(~has).squeeze(1)
             if empty.numel():
@@ -114,18 +133,14 @@ class Reservoirs:
     def driven(self, particles: Particles) -> Particles:
         """Give the buffers' particles their velocity for the present time."""
         times = self.domain.member_times(particles.members)
-        active = self._active()
         inflow = self.inflow(times)
         velocity = particles.velocity
-        for rank, (number, _, frame) in enumerate(active):
-            # several valves at once: filling goes through the first, emptying through the last
-            filling, emptying = rank == 0, rank == len(active) - 1
-            share = inflow.clamp_min(0.0) * filling + inflow.clamp_max(0.0) * emptying
+        for number, frame in self._active():
             row = torch.nonzero(particles.kind == RESERVOIR + number).squeeze(1)
             owner, old = particles.member[row], velocity[row]
             along = (old * frame.normal).sum(1)
             own = self._orifice_velocity(frame)
-            speed = -share / frame.area  # outward
+            speed = -self._flux_through(number, inflow) / frame.area  # outward
             target = self._profile(along - (own * frame.normal).sum(), owner, speed, frame, particles)
             new = own + target[:, None] * frame.normal
             velocity = velocity.index_copy(0, row, new)
@@ -153,14 +168,14 @@ class Reservoirs:
 
     def _orifice_velocity(self, frame: _Frame) -> Tensor:
         """Velocity of the orifice itself (D,), from its key-frame motion."""
-        return self.domain.sample_at(frame.centre[None] - 0.0 * frame.normal).velocity[0]
+        return self.domain.sample_at(frame.centre[None]).velocity[0]
 
     def exchange(self, particles: Particles, record: Record) -> tuple[Particles, bool]:
         """Turn particles that have crossed an open orifice into the other kind; feed and clear the far ends."""
         kind = particles.kind
         gone = torch.zeros_like(particles.fluid)
         fresh: list[Particles] = []
-        for number, _, frame in self._active():
+        for number, frame in self._active():
             height = frame.height(particles.position)
             label = RESERVOIR + number
             entered = (kind == label) & (height < 0.0)
@@ -177,7 +192,7 @@ class Reservoirs:
             kind = torch.where(out, torch.full_like(kind, label), kind)
             gone |= far
             for counter, which in ((record.inserted, entered), (record.removed, out)):
-                counter[:, number] += particles.per_member(which.to(torch.int64), "sum")
+                counter[:, self.valve_of[number]] += particles.per_member(which.to(torch.int64), "sum")
         changed = bool(fresh) or bool(gone.any())
         if not changed and kind is particles.kind:
             return particles, False
@@ -195,7 +210,7 @@ class Reservoirs:
         A buffer so takes on the velocity profile that the field has at the orifice.
         """
         points = particles.position
-        for number, _, frame in self._active():
+        for number, frame in self._active():
             height = frame.height(points)
             inward = (-height - _MOUTH)[:, None] * frame.normal
             points = torch.where((particles.kind == RESERVOIR + number)[:, None], points + inward, points)
@@ -203,18 +218,19 @@ class Reservoirs:
 
 
 class _Frame:
-    """An orifice in internal units on the device."""
+    """An opening in internal units on the device."""
 
-    def __init__(self, orifice: Orifice, length: float, dtype: torch.dtype, device: str) -> None:
+    def __init__(self, plane: OrificePlane, length: float, dtype: torch.dtype, device: str) -> None:
         def tensor(value: np.ndarray) -> Tensor:
             return torch.as_tensor(np.ascontiguousarray(value), dtype=dtype, device=device)
 
-        self.centre, self.normal = tensor(orifice.centre / length), tensor(orifice.normal)
-        basis = plane_frame(orifice.normal)
-        self.basis = tensor(basis)
-        self.rim = tensor((orifice.rim - orifice.centre) / length @ basis)
-        self.area = float(orifice.area / length ** len(orifice.normal.reshape(-1)[1:]))
-        self.radius = float(self.rim.reshape(-1, self.rim.shape[-1]).norm(dim=1).max())
+        self._plane = OrificePlane(
+            plane.centroid / length, plane.normal, plane.area / length ** len(plane.basis), plane.basis,
+            plane.rim / length, plane.edges,
+        )
+        self.centre, self.normal, self.basis = tensor(self._plane.centroid), tensor(plane.normal), tensor(plane.basis)
+        self.area = float(self._plane.area)
+        self.radius = float(np.linalg.norm(self._plane.outline, axis=1).max())
 
     def height(self, position: Tensor) -> Tensor:
         """Outward distance from the plane, (n,)."""
@@ -222,15 +238,14 @@ class _Frame:
 
     def inset(self, position: Tensor) -> Tensor:
         """In-plane distance from the rim, (n,), positive over the opening."""
-        return polygon_inset((position - self.centre) @ self.basis, self.rim)
+        return self._plane.lateral_distance(position)
 
     def lattice(self, length: float) -> Tensor:
         """Unit lattice in the channel of the given length behind the opening, (n, D)."""
         reach = int(np.ceil(self.radius)) + 1
         axis = torch.arange(-reach, reach, dtype=self.centre.dtype, device=self.centre.device) + 0.5
-        flat = torch.cartesian_prod(*[axis] * self.basis.shape[1]).reshape(-1, self.basis.shape[1])
-        flat = flat[polygon_inset(flat, self.rim) > 0]
-        layers = torch.arange(int(length), dtype=flat.dtype, device=flat.device) + 0.5
-        place = flat @ self.basis.T
-        columns = place[:, None, :] + layers[None, :, None] * self.normal
-        return self.centre + columns.reshape(-1, self.centre.shape[0])
+        flat = torch.cartesian_prod(*[axis] * self.basis.shape[0]).reshape(-1, self.basis.shape[0])
+        place = self.centre + flat @ self.basis
+        place = place[self.inset(place) > 0]
+        layers = torch.arange(int(length), dtype=place.dtype, device=place.device) + 0.5
+        return (place[:, None, :] + layers[None, :, None] * self.normal).reshape(-1, self.centre.shape[0])

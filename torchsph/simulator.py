@@ -18,7 +18,7 @@ from .scene import Scene
 from .schemes import WeaklyCompressible, preset
 from .seeding import Seeding, seed_particles
 from .terms import LIMITS, step_limits
-from .transfer import Fetched, fetch_at
+from .transfer import Fetched, fetch_at, pulled
 from .units import Units
 
 # how far particles move before the neighbours are searched again, in spacings
@@ -99,8 +99,9 @@ class Simulation:
             artificial=None if not scheme.artificial_viscosity else scheme.artificial_viscosity * sound,
             smoothing_length=scheme.smoothing_ratio,
         )
+        self._backend = choose_backend(simulator.backend, simulator.device)
         search = PairSearch(
-            choose_backend(simulator.backend, simulator.device), self.domain.support_radius, _SEARCH_MARGIN,
+            self._backend, self.domain.support_radius, _SEARCH_MARGIN,
             self.domain.period,
         )
         self._stepper = Stepper(scheme, self._coefficients, search, scene.dimension)
@@ -172,8 +173,8 @@ class Simulation:
 
     def _take_step(self, step: Tensor) -> None:
         before = self.particles
-        after, acceleration = self._stepper.step(before, step, self._steps, self.domain)
-        after = self.domain.constrain(after, self.record)
+        after, acceleration, wall = self._stepper.step(before, step, self._steps, self.domain)
+        after = self.domain.constrain(before, after, wall, step, self.record)
         self._steps += 1
         finite = torch.isfinite(after.position).all(1) & torch.isfinite(after.velocity).all(1)
         finite &= torch.isfinite(after.deviation)
@@ -217,6 +218,17 @@ class Simulation:
         self.particles = self.domain.imposed(self.particles, grid, velocity, mask, self.time)
         self._forget_pairs()
 
+    def pull(self, grid: Grid, target: Tensor, gain: Tensor, weight: Tensor) -> None:
+        """Pull the particles' velocities towards a measured grid.
+
+        Args:
+            target: (D, *shape), m/s. gain: (*shape) in [0, 1]. weight: (*shape) confidence, 0 where nothing is known.
+        """
+        p = self.particles
+        points = p.position * self.units.length
+        moved = pulled(points, p.velocity * self.units.speed, grid, target, gain, weight) / self.units.speed
+        self.particles = p.changed(velocity=torch.where(p.fluid[:, None], moved, p.velocity))
+
     def nudge(self, grid: Grid, increment: Tensor, mask: Tensor) -> float:
         """Add an increment given on a grid to the particles' velocities; returns the RMS it changed them by, m/s.
 
@@ -247,7 +259,9 @@ class Simulation:
         points = grid.nodes(dtype=torch.float64, device=p.position.device)[node] / self.units.length
         points = points.to(p.position.dtype).repeat(self.members, 1)
         owner = torch.arange(self.members, device=p.member.device).repeat_interleave(len(node))
-        found = fetch_at(points, owner, p.position, p.member, carried, FETCH_RADIUS)
+        found = fetch_at(
+            self._backend, points, owner, p.position, p.member, carried, FETCH_RADIUS, period=self.domain.period
+        )
         dimension = grid.dimension
         value = p.velocity.new_zeros((self.members, dimension, grid.size))
         covered = torch.zeros((self.members, grid.size), dtype=torch.bool, device=p.member.device)

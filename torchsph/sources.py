@@ -8,7 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .orifice import Orifice
+import geometry
+
 from .particles import Particles
 from .record import Record
 from .scene import Scene
@@ -31,13 +32,16 @@ class Sources:
         self.valves = scene.valves
         self._core: dict[int, float] = {}
         self._track: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+        openings = geometry.orifices(self.motion)
         for valve in scene.valves:
-            orifices = [Orifice.of(self.motion.surface(t), valve.region) for t in self.motion.time]
-            area = float(np.mean([o.area for o in orifices]))
+            # a source stands at the largest opening of its region
+            mine = max((o for o in openings if o.label == valve.region), key=lambda o: o.area(self.motion.time[0]))
+            planes = [mine.at(float(t)) for t in self.motion.time]
+            area = float(np.mean([plane.area for plane in planes]))
             radius = math.sqrt(area / math.pi) if scene.dimension == 3 else 0.5 * area
             self._core[valve.region] = model.core * radius / units.length
-            centre = np.stack([o.centre for o in orifices]) / units.length
-            self._track[valve.region] = (centre, np.stack([o.normal for o in orifices]))
+            centre = np.stack([plane.centroid for plane in planes]) / units.length
+            self._track[valve.region] = (centre, np.stack([plane.normal for plane in planes]))
         self.dimension = scene.dimension
 
     def strength(self, time: float) -> float:

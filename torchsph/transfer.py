@@ -14,10 +14,12 @@ from torch import Tensor
 
 from geometry import Grid
 
-from .pairs.search import cross_pairs
+from .pairs.interface import Backend, Support
+from .smoothing import kernel
 
-# slopes are damped by this share of m0 R^2: a lopsided neighbourhood at a wall falls back to the plain average
-_SLOPE_RIDGE = 1e-3
+# neighbours that lie nearly in a plane, or on a line, say nothing of the slope across it: below this ratio of the
+# spread's determinant to that of a round spread of the same size, the plain average is taken
+_LEAST_ROUNDNESS = 1e-3
 _CHUNK = 1 << 15
 
 
@@ -36,29 +38,46 @@ def wendland_weight(ratio: Tensor) -> Tensor:
 
 
 def first_order_value(
-    moment0: Tensor, moment1: Tensor, moment2: Tensor, value0: Tensor, value1: Tensor, radius: float
+    moment0: Tensor, moment1: Tensor, moment2: Tensor, value0: Tensor, value1: Tensor
 ) -> Tensor:
     """MLS value at the origin from moments of a weight w over offsets s and values A.
 
     Args: sums of w (M,), w s (M, D), w s (x) s (M, D, D), w A (M, C), w s (x) A (M, D, C).
-    Returns (M, C): a of the weighted fit A ~ a + s . b, with a ridge on b; 0 where the sum of w is 0.
+    Returns (M, C): a of the weighted fit A ~ a + s . b; 0 where the sum of w is 0.
     """
-    dimension = moment1.shape[1]
     safe = torch.where(moment0 > 0, moment0, torch.ones_like(moment0))
-    ridge = _SLOPE_RIDGE * radius * radius * safe
-    eye = torch.eye(dimension, dtype=moment0.dtype, device=moment0.device)
-    # eliminate a: (M2 - m1 m1'/m0 + ridge) b = m1A - m1 m0A / m0
-    schur = moment2 - moment1[:, :, None] * moment1[:, None, :] / safe[:, None, None] + ridge[:, None, None] * eye
-    right = value1 - moment1[:, :, None] * (value0 / safe[:, None])[:, None, :]
-    slope = torch.linalg.solve(schur, right)
     mean = value0 / safe[:, None]
+    # eliminate a: (M2 - m1 m1' / m0) b = m1A - m1 m0A / m0
+    spread = moment2 - moment1[:, :, None] * moment1[:, None, :] / safe[:, None, None]
+    right = value1 - moment1[:, :, None] * mean[:, None, :]
+    slope = _solve_small(spread, right)
     value = mean - (moment1[:, :, None] * slope).sum(1) / safe[:, None]
     return torch.where(moment0[:, None] > 0, value, torch.zeros_like(value))
 
 
+def _solve_small(matrix: Tensor, right: Tensor) -> Tensor:
+    """Solve (M, D, D) x = (M, D, C) for D = 2, 3 by cofactors (a batched LAPACK call costs ten times as much).
+
+    Symmetric, not negative; where the matrix is nearly singular (``_LEAST_ROUNDNESS``) the answer is 0.
+    """
+    dimension = matrix.shape[-1]
+    if dimension == 2:
+        a, b, c, d = matrix[:, 0, 0], matrix[:, 0, 1], matrix[:, 1, 0], matrix[:, 1, 1]
+        rows = [torch.stack([d, -b], 1), torch.stack([-c, a], 1)]
+        determinant = a * d - b * c
+    else:
+        x, y, z = matrix.unbind(2)  # columns
+        rows = [torch.linalg.cross(y, z), torch.linalg.cross(z, x), torch.linalg.cross(x, y)]
+        determinant = (x * rows[0]).sum(1)
+    round_one = (matrix.diagonal(dim1=1, dim2=2).sum(1) / dimension) ** dimension
+    regular = determinant > _LEAST_ROUNDNESS * round_one
+    inverse = torch.where(regular, 1.0 / torch.where(regular, determinant, torch.ones_like(determinant)), 0.0)
+    return torch.stack(rows, 1) @ right * inverse[:, None, None]
+
+
 def fetch_at(
-    points: Tensor, point_member: Tensor, position: Tensor, member: Tensor, value: Tensor, radius: float,
-    *, widen: int = 2,
+    backend: Backend, points: Tensor, point_member: Tensor, position: Tensor, member: Tensor, value: Tensor,
+    radius: float, *, period: Tensor | None = None, widen: int = 2,
 ) -> Fetched:
     """Particle values at points by first-order MLS.
 
@@ -71,43 +90,24 @@ def fetch_at(
     Returns:
         ``Fetched`` with value (M, C) and covered (M,); uncovered points hold 0.
     """
+    dimension = points.shape[1]
     total = value.new_zeros((points.shape[0], value.shape[1]))
     covered = torch.zeros(points.shape[0], dtype=torch.bool, device=points.device)
     open_points = torch.arange(points.shape[0], device=points.device)
     for _ in range(widen + 1):
         if open_points.numel() == 0:
             break
-        some, enough = _moving_least_squares(
-            points[open_points], point_member[open_points], position, member, value, radius
+        support = Support(kernel("wendland_c2"), 0.5 * radius, dimension)
+        m = backend.interpolate(
+            position, member, value, support, points[open_points], point_member[open_points], period=period
         )
+        some = first_order_value(m.value, m.first, m.second, m.field, m.field_first)
+        enough = m.count > dimension
         total[open_points[enough]] = some[enough]
         covered[open_points[enough]] = True
         open_points = open_points[~enough]
         radius *= 1.5
     return Fetched(total, covered)
-
-
-def _moving_least_squares(
-    points: Tensor, point_member: Tensor, position: Tensor, member: Tensor, value: Tensor, radius: float
-) -> tuple[Tensor, Tensor]:
-    row, particle = cross_pairs(points, point_member, position, member, radius)
-    offset = position.index_select(0, particle) - points.index_select(0, row)
-    weight = wendland_weight(offset.norm(dim=1) / radius)
-    first = weight[:, None] * offset
-    carried = value.index_select(0, particle)
-    count, dimension, channels = points.shape[0], points.shape[1], value.shape[1]
-
-    def collect(part: Tensor) -> Tensor:
-        flat = part.reshape(part.shape[0], -1)
-        return flat.new_zeros((count, flat.shape[1])).index_add(0, row, flat).reshape(count, *part.shape[1:])
-
-    moment0 = collect(weight)
-    second = collect(first[:, :, None] * offset[:, None, :])
-    value1 = collect(first[:, :, None] * carried[:, None, :])
-    fitted = first_order_value(moment0, collect(first), second, collect(weight[:, None] * carried), value1, radius)
-    neighbours = torch.bincount(row, minlength=count)
-    assert value1.shape == (count, dimension, channels)
-    return fitted, (neighbours > dimension) & (moment0 > 0)
 
 
 def impose_at(
@@ -148,7 +148,7 @@ def _impose_chunk(
     moment0 = w.sum(1)
     value = first_order_value(
         moment0, first.sum(1), first.transpose(1, 2) @ offset, (w[:, :, None] * carried).sum(1),
-        first.transpose(1, 2) @ carried, reach,
+        first.transpose(1, 2) @ carried,
     )
     full = _full_weight(dimension, reach)
     return value, moment0 / full
@@ -172,6 +172,15 @@ def _full_weight(dimension: int, reach: float) -> float:
     """Sum of the weights at a point in the middle of a complete grid: the kernel's integral over one node volume."""
     # integral of (1-s)^4 (1+4s) over the disc, the ball of radius R: pi R^2 / 7, 4 pi R^3 / 42 ... by Beta functions
     return {2: 3.141592653589793 / 7.0, 3: 2.0 * 3.141592653589793 / 21.0}[dimension] * reach**dimension
+
+
+def pulled(
+    points: Tensor, velocity: Tensor, grid: Grid, target: Tensor, gain: Tensor, weight: Tensor
+) -> Tensor:
+    """Velocity (N, D) pulled towards a grid field where it is known; see ``particle_filter``."""
+    value, share = impose_at(points, grid, torch.cat([target, gain[None]]), weight)
+    strength = torch.where(share > 0, value[:, -1].clamp(0.0, 1.0), torch.zeros_like(share))
+    return velocity + strength[:, None] * (value[:, :-1] - velocity)
 
 
 def fill_beyond(field: Tensor, mask: Tensor, grid: Grid, domain: object, layers: int = 3) -> Tensor:

@@ -10,10 +10,9 @@ from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 from torch.nn import functional
 
-from geometry import Grid, Surface, WallMotion, grid_winding
+from geometry import Grid, OrificePlane, Surface, WallMotion, grid_winding, orifices
 from geometry.closest import SurfaceIndex
 
-from .orifice import Orifice
 from .smoothing import SmoothingKernel
 from .walls import WallSample
 
@@ -44,6 +43,7 @@ class WallFields:
         self.reach = kernel.support * smoothing_length  # internal
         self.grid = self._grid()
         self.dimension = self.grid.dimension
+        self._openings = orifices(motion)
         self._made: OrderedDict[tuple[int, tuple[int, ...]], Tensor] = OrderedDict()
 
     def _grid(self) -> Grid:
@@ -69,7 +69,7 @@ class WallFields:
     def _make(self, frame: int, open_regions: tuple[int, ...]) -> Tensor:
         time = float(self.motion.time[frame])
         surface = self.motion.surface(time)
-        distance, velocity = self._distance(surface, self.motion.velocity(time), open_regions)
+        distance, velocity = self._distance(surface, time, open_regions)
         shape = self.grid.shape
         d = torch.from_numpy(distance).reshape(shape) / self.spacing
         channels = [d[None], _normals(d), torch.from_numpy(velocity.T / self.speed).reshape(-1, *shape)]
@@ -78,7 +78,7 @@ class WallFields:
         return torch.cat(channels).to(self.dtype).to(self.device)
 
     def _distance(
-        self, surface: Surface, velocity: np.ndarray, open_regions: tuple[int, ...]
+        self, surface: Surface, time: float, open_regions: tuple[int, ...]
     ) -> tuple[np.ndarray, np.ndarray]:
         """Distance (n,) from the closed part of the wall, positive in blood and open channels; velocity (n, D)."""
         nodes = self.grid.nodes().numpy()
@@ -87,16 +87,17 @@ class WallFields:
         solid = Surface(surface.vertices, surface.faces[shut], surface.region[shut])
         near, donor = self._band(inside)
         found = SurfaceIndex(solid, self.spacing * _FIELD_SPACING).query(nodes[near])
-        carried = found.interpolate(solid, velocity)[donor]
+        carried = found.interpolate(solid, self.motion.velocity(time))[donor]
         magnitude = found.distance[donor]
         beyond = np.ones(len(nodes), bool)
         beyond[near] = False
         magnitude[beyond] += np.linalg.norm(nodes[beyond] - nodes[near[donor[beyond]]], axis=1)
         inside = inside.reshape(-1)
         distance = np.where(inside, magnitude, -magnitude)
-        for region in open_regions:
-            depth = (self.reach + 2.0) * self.spacing
-            distance = _with_channel(distance, nodes, inside, Orifice.of(surface, region), depth)
+        depth = (self.reach + 2.0) * self.spacing
+        for opening in self._openings:
+            if opening.label in open_regions:
+                distance = _with_channel(distance, nodes, inside, opening.at(time), depth)
         return distance, carried
 
     def _band(self, inside: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -135,15 +136,15 @@ class WallFields:
 
 
 def _with_channel(
-    distance: np.ndarray, nodes: np.ndarray, inside: np.ndarray, orifice: Orifice, depth: float
+    distance: np.ndarray, nodes: np.ndarray, inside: np.ndarray, opening: OrificePlane, depth: float
 ) -> np.ndarray:
     """Count the straight channel behind an open orifice as fluid, as far as any kernel sees."""
-    height = orifice.height(nodes)
-    near = ~inside & (height > -0.1 * depth) & (height < 2.0 * depth)
-    lateral = orifice.inset(nodes[near])
+    height = opening.height(torch.from_numpy(nodes)).numpy()
+    near = np.flatnonzero(~inside & (height > -0.1 * depth) & (height < 2.0 * depth))
+    lateral = opening.lateral_distance(torch.from_numpy(nodes[near])).numpy()
     # beside the channel the rim, a part of the solid faces, already gives the distance
     inner = lateral > 0
-    where = np.flatnonzero(near)[inner]
+    where = near[inner]
     distance[where] = np.minimum(np.abs(distance[where]), lateral[inner])
     return distance
 
