@@ -9,18 +9,25 @@ from .errors import InvalidInput, NotConverged
 from .field import SplineField
 from .knots import Knots
 from .krylov import Solution, lsqr
+from .likelihood import Choice
+from .lsmr import lsmr
 from .operators import CellRows, DirectionRows, DivergenceRows, System, VectorRows
+from .pcg import pcg
+from .posterior import Posterior
 from .smoother import Smoother
+from .sparse import sparse_matrix, sparse_operators
 from .walls import WallRows
 
 __all__ = [
     "CellRows",
+    "Choice",
     "DirectionRows",
     "DivergenceRows",
     "Factor",
     "InvalidInput",
     "Knots",
     "NotConverged",
+    "Posterior",
     "PreparedSystem",
     "Smoother",
     "Solution",
@@ -29,6 +36,10 @@ __all__ = [
     "VectorRows",
     "WallRows",
     "basis",
+    "lsmr",
     "lsqr",
+    "pcg",
     "solve_direct",
+    "sparse_matrix",
+    "sparse_operators",
 ]

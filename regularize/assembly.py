@@ -7,7 +7,7 @@ dense block instead of one sparse product per row.
 import torch
 
 from .operators import CellRows, RowBlock, System, VectorRows
-from .ordering import Ordering, local_permutation
+from .ordering import Ordering
 
 CELLS_PER_PASS = 64  # bounds the dense blocks (cells, L C, L C) of a pass to about 20 MB for cubic 3-D
 
@@ -46,7 +46,7 @@ def cell_gram(block: CellRows) -> torch.Tensor:
 def _scatter(band: torch.Tensor, gram: torch.Tensor, c: int, ordering: Ordering, part: slice) -> None:
     """Add blocks (cells, L C, L C), local coefficients in array order, to the lower band."""
     unknown = (ordering.position[part][:, :, None] * c + torch.arange(c)).flatten(1)
-    permuted = (local_permutation(ordering)[:, None] * c + torch.arange(c)).flatten()
+    permuted = (ordering.local()[:, None] * c + torch.arange(c)).flatten()
     row, column = torch.tril_indices(len(permuted), len(permuted)).unbind()
     i, j = unknown[:, row], unknown[:, column]
     values = gram[:, permuted[row], permuted[column]]

@@ -1,7 +1,10 @@
 """Direct solution: banded Cholesky of the normal matrix with float64 refinement on the rows themselves."""
 
+from copy import copy
+
 import torch
 from scipy.linalg import LinAlgError, cho_solve_banded, cholesky_banded
+from scipy.linalg.blas import dtbsv
 
 from . import native
 from .assembly import reference_band
@@ -25,6 +28,15 @@ class PreparedSystem:
             raise InvalidInput("engine is 'native' but no compiled library was built; use 'reference'")
         self.engine = engine or ("native" if native.available() else "reference")
         self._packed = native.PackedSystem(system, self.ordering) if self.engine == "native" else None
+
+    def with_targets(self, system: System) -> "PreparedSystem":
+        """The same rows in the same order with the right-hand sides of ``system``."""
+        other = copy(self)
+        other.system = system
+        if self._packed is not None:
+            other._packed = copy(self._packed)
+            other._packed.system = system
+        return other
 
     def band(self) -> torch.Tensor:
         """Lower band (unknowns, width) of the normal matrix, float64."""
@@ -72,6 +84,18 @@ class Factor:
         flat = right.double().reshape(right.shape[0] * right.shape[1], *right.shape[2:])
         solved = cho_solve_banded((self.band, True), flat.numpy(), check_finite=False)
         return torch.from_numpy(solved).view(right.shape)
+
+    def sample(self, precision: float, generator: torch.Generator) -> torch.Tensor:
+        """(active, C) Gaussian draw of mean 0 with ``precision`` times the factored matrix as precision."""
+        count = self.band.shape[1]
+        white = torch.randn(count, generator=generator, dtype=torch.float64).numpy()
+        # L' x = z gives x the covariance (L L')^-1
+        draw = dtbsv(self.band.shape[0] - 1, self.band, white, lower=1, trans=1)
+        return torch.from_numpy(draw).view(len(self.ordering.nodes), -1) / precision**0.5
+
+    def diagonal(self) -> torch.Tensor:
+        """(unknowns,) squares of the factor's diagonal: conditional precisions, a guess of the matrix's."""
+        return torch.from_numpy(self.band[0]).square()
 
     def log_determinant(self) -> float:
         """Natural logarithm of the determinant of the normal matrix."""

@@ -4,10 +4,12 @@ from collections.abc import Sequence
 
 import torch
 
+from .direct import Factor
 from .errors import InvalidInput
 from .knots import Knots
 from .krylov import Solution
 from .likelihood import Choice
+from .posterior import Posterior
 
 
 class SplineField:
@@ -25,9 +27,12 @@ class SplineField:
         solution: Solution | None = None,
         left_out: int = 0,
         choice: Choice | None = None,
+        posterior: Posterior | None = None,
+        factor: Factor | None = None,
     ) -> None:
         self.knots, self.coefficients, self.covered = knots, coefficients, covered
         self.solution, self.left_out, self.choice = solution, left_out, choice
+        self.posterior, self.factor = posterior, factor
 
     @property
     def components(self) -> int:
@@ -52,6 +57,16 @@ class SplineField:
         """(n,) in 1/s, from the analytic derivatives."""
         gradient = self.gradient(points, outside)
         return sum(gradient[:, k, k] for k in range(self.components))
+
+    def std(self, points: torch.Tensor, outside: float = float("nan")) -> torch.Tensor:
+        """Posterior standard deviation (n, C) in m/s at points (n, A); fit with ``uncertainty=True``."""
+        if self.posterior is None:
+            raise InvalidInput("this field holds no posterior: fit it with uncertainty=True")
+        points = self._checked(points)
+        supported = self.supported(points)
+        out = torch.full((len(points), self.components), outside).to(self.coefficients)
+        out[supported] = self.posterior.variance(points[supported]).sqrt().to(out)
+        return out
 
     def grid(
         self,

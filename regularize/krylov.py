@@ -36,7 +36,6 @@ def lsqr(
     damping: float = 0.0,
     tolerance: float = 1e-6,
     max_iterations: int = 5000,
-    restarts: int = 10,
     strict: bool = True,
 ) -> Solution:
     """Minimise |w * (A x - b)|^2 + damping^2 |x|^2.
@@ -46,6 +45,24 @@ def lsqr(
     3.24 and 3.25. Raises NotConverged, unless ``strict`` is False, when the true relative gradient stays
     above ``tolerance``.
     """
+    options = {"damping": damping, "tolerance": tolerance, "max_iterations": max_iterations, "strict": strict}
+    return iterate("lsqr", _bidiagonalise, matvec, rmatvec, b, weight, **options)
+
+
+def iterate(
+    name: str,
+    run: Callable[..., tuple[torch.Tensor, int]],
+    matvec: Apply,
+    rmatvec: Apply,
+    b: torch.Tensor,
+    weight: torch.Tensor | None,
+    *,
+    damping: float,
+    tolerance: float,
+    max_iterations: int,
+    strict: bool,
+) -> Solution:
+    """Run a Krylov method, look at the true gradient, and restart it on the residual while that helps."""
     if tolerance <= 0:
         raise InvalidInput(f"tolerance is {tolerance}: it must be positive")
     w = torch.ones_like(b) if weight is None else weight.to(b.dtype)
@@ -54,38 +71,33 @@ def lsqr(
     scale = float(right.norm())
     x = torch.zeros_like(right)
     if scale == 0:
-        return Solution(x.to(b.dtype), 0.0, 0, "zero right-hand side")
-
-    def weighted(v: torch.Tensor) -> torch.Tensor:
-        return w * matvec(v)
-
-    def adjoint(u: torch.Tensor) -> torch.Tensor:
-        return rmatvec(w * u)
-
+        return Solution(x.to(b.dtype), 0.0, 0, "zero right-hand side", name)
     done, true, reason = 0, 1.0, "iteration limit"
-    for _ in range(restarts + 1):
-        residual = w64 * (b64 - matvec(x))
-        before = true
-        aim = tolerance * scale
-        step, used = _bidiagonalise(
-            weighted, adjoint, residual, x, damping, aim, max_iterations - done, b.dtype
+    while done < max_iterations:
+        residual, before = w64 * (b64 - matvec(x)), true
+        step, used = run(
+            lambda v: w * matvec(v),
+            lambda u: rmatvec(w * u),
+            residual,
+            x,
+            damping,
+            tolerance * scale,
+            max_iterations - done,
+            b.dtype,
         )
         x = x + step
-        done += used
+        done += max(used, 1)
         true = float((rmatvec(w64 * (w64 * (b64 - matvec(x)))) - damping**2 * x).norm()) / scale
         if true <= tolerance:
-            return Solution(x.to(b.dtype), true, done, "gradient below tolerance")
-        if done >= max_iterations:
-            break
-        if true > 0.5 * before:
+            return Solution(x.to(b.dtype), true, done, "gradient below tolerance", name)
+        if done < max_iterations and true > 0.5 * before:
             reason = "stalled at the precision of the arithmetic"
             break
-    solution = Solution(x.to(b.dtype), true, done, reason)
+    solution = Solution(x.to(b.dtype), true, done, reason, name)
     if strict:
         raise NotConverged(
-            f"LSQR: true relative gradient {true:.2e} after {done} iterations ({reason}), asked "
-            f"for {tolerance:.1e}; raise max_iterations or the tolerance, use float64, or solve "
-            "directly",
+            f"{name}: true relative gradient {true:.2e} after {done} iterations ({reason}), asked for "
+            f"{tolerance:.1e}; raise max_iterations or the tolerance, use float64, or solve directly",
             solution,
         )
     return solution
@@ -106,7 +118,7 @@ def _bidiagonalise(
     With damping, the rows [damping I] have the residual -damping x0, carried as a second part of u.
     """
     u, low = residual.to(dtype), (-damping * x0).to(dtype)
-    beta = _norm(u, low)
+    beta = norm_of(u, low)
     u, low = u / beta, low / beta
     v = rmatvec(u) + damping * low
     alpha = float(v.norm())
@@ -119,7 +131,7 @@ def _bidiagonalise(
     while count < limit:
         count += 1
         u, low = matvec(v) - alpha * u, damping * v - alpha * low
-        beta = _norm(u, low)
+        beta = norm_of(u, low)
         if beta > 0:
             u, low = u / beta, low / beta
         v = rmatvec(u) + damping * low - beta * v
@@ -136,6 +148,6 @@ def _bidiagonalise(
     return x.double(), count
 
 
-def _norm(u: torch.Tensor, low: torch.Tensor) -> float:
+def norm_of(u: torch.Tensor, low: torch.Tensor) -> float:
     # hypot of the two parts, accumulated in float64 whatever the iteration's precision
     return float((u.double().square().sum() + low.double().square().sum()).sqrt())

@@ -21,10 +21,11 @@ from .direct import Factor, PreparedSystem
 from .knots import Knots
 from .operators import CellRows, RowBlock, System, VectorRows
 from .ordering import Ordering, order
-from .robust import robust_weight
+from .robust import inflation, robust_weight
 
 PROBES = 16  # Rademacher vectors per trace: its error is about sqrt(2 / (PROBES unknowns)), under 1 %
 RELAXATION = 1.6  # the plain update converges from one side at a rate near 0.6
+MOST_PER_ROUND = 1e3  # growth of a precision, where a penalty's energy vanishes
 SETTLED = 0.03  # a round that changes no precision by more than this fraction ends the search
 FLOOR = 1e-3  # slip precisions below this share of the data's no longer matter
 NOISE_FLOOR = 1e-4  # of the data's root mean square: exact data would send the precision to infinity
@@ -130,39 +131,49 @@ class LikelihoodSearch:
         return Choice(noise_each, (rough / scale) ** 0.25, chosen, self.factor, count, settled)
 
     def _round(self, fit: torch.Tensor, rough: float, slip: float) -> tuple[torch.Tensor, float, float]:
+        prior, right = self._prior(fit, rough, slip)
+        posterior = Factor(prior + widen(self.data.band, fit), self.ordering)
+        prior = Factor(prior, self.ordering)
+        x = posterior.solve(right + fit * self.data.right)
+        known, all_known = prior.solve(self.probes), posterior.solve(self.probes)
+        new_fit, gained = self._noise(x, fit, all_known), known - all_known
+        step = max(self.fit.knots.spacing)
+        low, high = (self._scale(fit) * (factor * step) ** 4 for factor in (SHARPEST, 1 / SHARPEST))
+        rough *= self._step(gained, self.curvature_probes, self.curvature.energy(x))
+        rough = min(max(rough, low), high)
+        if slip > 0:
+            slip *= self._step(gained, self.slip_probes, self.slip.energy(x))
+            slip = min(slip, self._scale(fit) / SHARPEST**2)
+        if self.robust is not None:
+            self._reweigh(x)
+        return new_fit, rough, slip
+
+    def _prior(self, fit: torch.Tensor, rough: float, slip: float) -> tuple[torch.Tensor, torch.Tensor]:
+        """Band and right-hand side of all penalties."""
         scale, one = self._scale(fit), torch.ones(self.components, dtype=torch.float64)
         prior = scale * self.fixed + widen(self.curvature.band, rough * one)
-        right = scale * self.fixed_right + fit * self.data.right
+        right = scale * self.fixed_right
         if slip > 0:
             prior += widen(self.slip.band, slip * one)
             right = right + slip * self.slip.right
-        posterior = Factor(prior + widen(self.data.band, fit), self.ordering)
-        prior = Factor(prior, self.ordering)
-        x = posterior.solve(right)
-        known, all_known = prior.solve(self.probes), posterior.solve(self.probes)
+        return prior, right
+
+    def _noise(self, x: torch.Tensor, fit: torch.Tensor, all_known: torch.Tensor) -> torch.Tensor:
+        """(C,) new precisions of the samples: what they determine over how far the fit stays from them."""
         # tr(A^-1 S_k): how much of component k's data the posterior leaves free
         freed = (all_known * self.data.times(self.probes)).sum(dim=(0, 2)) / PROBES
         off = x - self.unpenalised
         misfit = (off * self.data.times(off)).sum(dim=0)
-        new_fit = (self.rank - fit * freed).clamp(min=1.0) / misfit.clamp(min=1e-300)
-        new_fit = new_fit.clamp(max=self.sharpest)
-        gained = known - all_known
-        ratio = float((gained * self.curvature_probes).sum()) / PROBES / self.curvature.energy(x)
-        coarse = max(self.fit.knots.spacing)
-        rough = min(
-            max(rough * ratio**RELAXATION, scale * (SHARPEST * coarse) ** 4), scale * (coarse / SHARPEST) ** 4
-        )
-        if slip > 0:
-            slip *= (float((gained * self.slip_probes).sum()) / PROBES / self.slip.energy(x)) ** RELAXATION
+        precision = (self.rank - fit * freed).clamp(min=1.0) / misfit.clamp(min=1e-300)
         if self.robust is not None:
-            self._reweigh(x)
-        return new_fit, rough, slip
+            precision = precision / inflation(self.robust, self.components) ** 2
+        return precision.clamp(max=self.sharpest)
 
     @staticmethod
     def _step(gained: torch.Tensor, probed: torch.Tensor, energy: float) -> float:
         """Factor on a penalty's precision: (tr(P^-1 G) - tr(A^-1 G)) over its energy, over-relaxed."""
         trace = float((gained * probed).sum()) / PROBES
-        return (max(trace, 1e-300) / max(energy, 1e-300)) ** RELAXATION
+        return min((max(trace, 1e-30) / max(energy, 1e-30)) ** RELAXATION, MOST_PER_ROUND)
 
     def _scale(self, fit: torch.Tensor) -> float:
         """Precision of the whole data set: what turns the Smoother's cost into a log-likelihood."""

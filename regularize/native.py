@@ -14,7 +14,7 @@ import torch
 from .assembly import cell_gram, empty_band
 from .bspline import pieces
 from .operators import CellRows, DirectionRows, DivergenceRows, RowBlock, System, VectorRows
-from .ordering import Ordering, local_permutation
+from .ordering import Ordering
 
 LEVELS = ("base", "avx2", "avx512")
 KINDS = {VectorRows: 0, DirectionRows: 1, DivergenceRows: 2}
@@ -136,7 +136,7 @@ class PackedSystem:
         self, block: CellRows, slots: torch.Tensor, x: torch.Tensor, out: torch.Tensor
     ) -> None:
         near = self.ordering.position[slots]
-        gram = cell_gram(block)[local_permutation(self.ordering)][:, :, local_permutation(self.ordering)]
+        gram = cell_gram(block)[self.ordering.local()][:, :, self.ordering.local()]
         pulled = x[near].flatten(1) @ gram.flatten(0, 1).flatten(1, 2)
         out.index_add_(0, near.flatten(), pulled.view(-1, block.components), alpha=-1.0)
 
@@ -165,7 +165,7 @@ class PackedSystem:
         )
 
     def _pack_cells(self, block: CellRows, start: torch.Tensor) -> _Rows:
-        local = local_permutation(self.ordering)
+        local = self.ordering.local()
         gram = cell_gram(block)[local][:, :, local].permute(1, 3, 0, 2)  # (C, C, L, L)
         scalar = not block.coupled
         gram = gram[0, 0] if scalar else gram

@@ -75,6 +75,21 @@ class VectorRows(_PointRows):
             out.index_add_(0, self.knots.local_nodes(self.cell[part]).flatten(), values.flatten(0, 1))
         return out
 
+    def with_target(self, target: torch.Tensor) -> "VectorRows":
+        """The same rows for other sample values (n, C)."""
+        other = object.__new__(VectorRows)
+        other.__dict__.update(self.__dict__)
+        other.target = (self.weight * target).flatten()
+        return other
+
+    def with_weight(self, factor: torch.Tensor | float) -> "VectorRows":
+        """The same rows with all weights multiplied by ``factor``, a number or (n, 1)."""
+        other = object.__new__(VectorRows)
+        other.__dict__.update(self.__dict__)
+        other.weight = self.weight * factor
+        other.target = (self.target.view(other.weight.shape) * factor).flatten()
+        return other
+
     def component(self, k: int) -> "VectorRows":
         """The rows of one component, as rows of a scalar field."""
         one = object.__new__(VectorRows)

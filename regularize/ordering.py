@@ -36,6 +36,12 @@ class Ordering:
         full[self.nodes] = x
         return full
 
+    def local(self) -> torch.Tensor:
+        """(L,) array-order place of each solve-order local coefficient."""
+        array_axes = [self.knots.axes - 1 - axis for axis in self.axes]
+        size = (self.knots.degree + 1,) * self.knots.axes
+        return torch.arange(self.knots.local_size).view(size).permute(array_axes).flatten()
+
     def slabs(self) -> torch.Tensor:
         """(slabs + 1,) starts in ``keys`` of runs of degree + 1 cell layers along the slowest axis.
 
@@ -63,9 +69,7 @@ def order(system: System) -> Ordering:
         number = number // knots.cells[axis]
     cell = torch.stack([columns[axis] for axis in range(knots.axes)], dim=-1)
     array_axes = [knots.axes - 1 - axis for axis in axes]
-    size = (knots.degree + 1,) * knots.axes
-    local = torch.arange(knots.local_size, device=keys.device).view(size).permute(array_axes).flatten()
-    touched = knots.local_nodes(cell)[:, local]
+    touched = knots.local_nodes(cell)[:, blank.local().to(keys.device)]
     used = torch.zeros(knots.nodes, dtype=torch.bool, device=keys.device)
     used[touched.flatten()] = True
     flat = torch.arange(knots.nodes, device=keys.device).view(knots.shape).permute(array_axes).flatten()
@@ -75,11 +79,3 @@ def order(system: System) -> Ordering:
     position = place[touched]
     half = int((position[:, -1] - position[:, 0]).max())
     return Ordering(knots, axes, keys, nodes, position, half)
-
-
-def local_permutation(ordering: Ordering) -> torch.Tensor:
-    """(L,) array-order place of each solve-order local coefficient."""
-    knots = ordering.knots
-    array_axes = [knots.axes - 1 - axis for axis in ordering.axes]
-    size = (knots.degree + 1,) * knots.axes
-    return torch.arange(knots.local_size).view(size).permute(array_axes).flatten()

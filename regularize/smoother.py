@@ -14,21 +14,26 @@ samples (ERRATA 3.17, 3.23), the meaning that table 4.1 needs.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from math import prod
 
 import torch
 
 from .bspline import DEGREES
-from .direct import solve_direct
+from .direct import Factor, PreparedSystem, solve_direct
 from .errors import InvalidInput
 from .field import SplineField
-from .krylov import lsqr
+from .krylov import Solution, lsqr
+from .lsmr import lsmr
+from .operators import System
+from .pcg import pcg
+from .problem import Problem
 from .robust import CUTOFFS
 from .rows import FitData, build_system, knots_for
 from .search import choose
+from .sparse import sparse_operators
 from .walls import WallRows
 
-SOLVERS = ("auto", "direct", "lsqr")
+SOLVERS = ("auto", "direct", "lsqr", "lsmr", "pcg")
+NEIGHBOUR_ITERATIONS = 25  # about what a factorisation costs
 SCALINGS = ("density", "thesis")
 AUTOMATIC = (None, "likelihood")
 
@@ -44,6 +49,8 @@ class Smoother:
     30 samples, or samples of no flow, leave nothing to choose from (``field.choice`` is None there).
     ``robust``: "tukey" or "huber" reweighting of outliers, found together with that choice.
     ``search_knots``: the choice is made on a grid this many times coarser, in at most ``rounds`` rounds.
+    ``solver``: "direct" (what "auto" picks), "lsqr", "lsmr", or "pcg" with a neighbouring frame's factor;
+    ``sparse``: the iterative ones store the matrix and its transpose instead of applying rows.
     ``tolerance``: true relative gradient at which a solver may stop; NotConverged otherwise.
     """
 
@@ -62,6 +69,7 @@ class Smoother:
     rounds: int = 12
     scaling: str = "density"
     solver: str = "auto"
+    sparse: bool = False
     tolerance: float = 1e-6
     max_iterations: int = 5000
 
@@ -130,15 +138,55 @@ class Smoother:
         *,
         divergence_points: torch.Tensor | None = None,
         box: tuple[Sequence[float], Sequence[float]] | None = None,
+        uncertainty: bool = False,
+        neighbour: SplineField | None = None,
     ) -> SplineField:
         """Fit samples velocity (n, D) in m/s at points (n, D) in m with confidences weight (n,) in [0, 1].
 
         ``wall``: rows on walls and valves. ``divergence_points`` (m, D): where the divergence is penalised
         (and the field counts as supported); absent: over every knot cell that holds samples or wall.
-        ``box``: lower and upper corner of the knot grid (default: around all points). Samples of zero weight
-        are ignored and may be NaN. Raises InvalidInput for bad input, NotConverged when the solver fails.
+        ``box``: lower and upper corner of the knot grid (default: around all points); give the same one for
+        all frames of a recording. ``uncertainty``: keep the factor for ``field.std``. ``neighbour``: with
+        solver="pcg", an earlier such fit on the same knots, whose factor and coefficients start this one (the
+        first frame, and one too unlike its neighbour, are solved directly). Samples of zero weight are
+        ignored and may be NaN. Raises InvalidInput for bad input, NotConverged when the solver fails.
         """
         data = FitData.checked(points, velocity, weight, wall, divergence_points, box, self.power)
+        problem = self._problem(data)
+        if self.solver == "pcg" and neighbour is not None:
+            solution, factor = self._with_neighbour(problem.system, neighbour)
+            return problem.field(solution, factor, own_factor=False)
+        if self.solver in ("lsqr", "lsmr"):
+            if uncertainty:
+                raise InvalidInput(f"solver {self.solver!r} keeps no factor for uncertainty: use 'direct'")
+            return problem.field(self._iterate(problem.system))
+        solution, factor = solve_direct(problem.system, tolerance=self.tolerance)
+        return problem.field(solution, factor if uncertainty or self.solver == "pcg" else None)
+
+    def fit_many(
+        self,
+        points: torch.Tensor,
+        velocities: torch.Tensor,
+        weight: torch.Tensor | None = None,
+        wall: WallRows | None = None,
+        *,
+        divergence_points: torch.Tensor | None = None,
+        box: tuple[Sequence[float], Sequence[float]] | None = None,
+    ) -> list[SplineField]:
+        """Fit B sets of samples velocities (B, n, D) at the same points and weights with one factorisation.
+
+        For ensemble members and frames of a fixed grid. Automatic choice is made once, from their mean.
+        """
+        velocities = torch.as_tensor(velocities)
+        if velocities.ndim != 3 or len(velocities) == 0:
+            raise InvalidInput(f"velocities have shape {tuple(velocities.shape)}: expected (B, n, D), B >= 1")
+        weight = torch.ones(velocities.shape[1]) if weight is None else torch.as_tensor(weight)
+        where = (divergence_points, box, self.power)
+        every = [FitData.checked(points, v, weight, wall, *where) for v in velocities]
+        problem = self._problem(replace(every[0], velocity=torch.stack([d.velocity for d in every]).mean(0)))
+        return problem.solve_all([data.velocity for data in every], self.tolerance)
+
+    def _problem(self, data: FitData) -> Problem:
         knots = knots_for(data, self.knots, self.nodes, self.degree)
         options, choice = self, None
         if self.automatic == "likelihood":
@@ -147,19 +195,23 @@ class Smoother:
         if choice is not None:
             options = self.fixed(curvature=choice.curvature, no_slip=choice.no_slip)
             data = data.reweighed(choice)
-        system = build_system(options, knots, data)
-        if self.solver == "lsqr":
-            solution = lsqr(
-                system.matvec,
-                system.rmatvec,
-                system.target(),
-                damping=system.damping,
-                tolerance=self.tolerance,
-                max_iterations=self.max_iterations,
+        return Problem(data, build_system(options, knots, data), choice)
+
+    def _iterate(self, system: System) -> Solution:
+        method = lsqr if self.solver == "lsqr" else lsmr
+        apply = sparse_operators(system) if self.sparse else (system.matvec, system.rmatvec)
+        options = {"tolerance": self.tolerance, "max_iterations": self.max_iterations}
+        return method(*apply, system.target(), damping=system.damping, **options)
+
+    def _with_neighbour(self, system: System, neighbour: SplineField) -> tuple[Solution, Factor]:
+        if neighbour.factor is None or neighbour.knots != system.knots:
+            raise InvalidInput(
+                "neighbour holds no factor of the same knot grid: fit it with solver='pcg' and the same box"
             )
-        else:
-            solution, _ = solve_direct(system, tolerance=self.tolerance)
-        coefficients = solution.x.to(data.velocity).view(knots.nodes, -1).T.reshape(-1, *knots.shape)
-        covered = torch.zeros(prod(knots.cells), dtype=torch.bool)
-        covered[system.cells()] = True
-        return SplineField(knots, coefficients, covered, solution, data.left_out, choice)
+        start, prepared = neighbour.coefficients.flatten(1).T, PreparedSystem(system)
+        limits = {"tolerance": self.tolerance, "max_iterations": NEIGHBOUR_ITERATIONS, "strict": False}
+        solution = pcg(prepared, neighbour.factor, start=start, **limits)
+        if solution.gradient <= self.tolerance:
+            return solution, neighbour.factor
+        # a neighbour too different costs more iterations than a factorisation of its own
+        return solve_direct(prepared, tolerance=self.tolerance)

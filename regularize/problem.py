@@ -1,0 +1,64 @@
+"""One assembled fit: checked samples, rows, what was chosen automatically, and the field of a solution."""
+
+from dataclasses import dataclass, replace
+from math import prod
+
+import torch
+
+from .direct import Factor, PreparedSystem, solve_direct
+from .field import SplineField
+from .krylov import Solution
+from .likelihood import Choice
+from .operators import System
+from .posterior import Posterior
+from .rows import FitData
+
+
+@dataclass(frozen=True)
+class Problem:
+    """The first block of ``system`` holds the samples of ``data``."""
+
+    data: FitData
+    system: System
+    choice: Choice | None
+
+    def field(self, solution: Solution, factor: Factor | None = None, own_factor: bool = True) -> SplineField:
+        """The field of a solution; the factor of ``system`` itself also gives its uncertainty."""
+        knots, data = self.system.knots, self.data
+        coefficients = solution.x.to(data.velocity).view(knots.nodes, -1).T.reshape(-1, *knots.shape)
+        covered = torch.zeros(prod(knots.cells), dtype=torch.bool)
+        covered[self.system.cells()] = True
+        posterior = None
+        if factor is not None and own_factor:
+            posterior = Posterior(factor, self.precision(solution), self.system.components)
+        return SplineField(
+            knots, coefficients, covered, solution, data.left_out, self.choice, posterior, factor
+        )
+
+    def precision(self, solution: Solution) -> float:
+        """Turns the cost into minus twice a log-posterior: the weight of all samples over their variance.
+
+        Without an automatic choice the variance is the fit's own mean squared residual.
+        """
+        fit = self.system.blocks[0]
+        scale = self.data.weight.double().square().sum()
+        scale = scale / (fit.weight.double().square().sum() / self.system.components)
+        if self.choice is not None:
+            return float(scale * (torch.tensor(self.choice.noise, dtype=torch.float64) ** -2).mean())
+        residual = fit.target.double() - fit.matvec(solution.x.view(self.system.knots.nodes, -1))
+        variance = residual.square().sum() / fit.weight.double().square().sum()
+        return float(scale / variance.clamp(min=1e-300))
+
+    def solve_all(self, velocities: list[torch.Tensor], tolerance: float) -> list[SplineField]:
+        """Fields of several sample sets (n, C) at the same points and weights: one factorisation."""
+        prepared = PreparedSystem(self.system)
+        factor = prepared.factor()
+        fields = []
+        for velocity in velocities:
+            fit = self.system.blocks[0].with_target(velocity)
+            system = System(
+                self.system.knots, self.system.components, [fit, *self.system.blocks[1:]], self.system.damping
+            )
+            solution, _ = solve_direct(prepared.with_targets(system), factor=factor, tolerance=tolerance)
+            fields.append(replace(self, system=system).field(solution))
+        return fields

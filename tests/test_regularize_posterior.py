@@ -1,0 +1,86 @@
+"""Posterior variances against the dense inverse, and calibrated on simulated data."""
+
+import pytest
+import torch
+from regularize_cases import blocks_of
+
+from regularize import InvalidInput, Posterior, PreparedSystem, Smoother, System, solve_direct
+from regularize.rows import FitData, build_system, knots_for
+
+SMALL = {"automatic": None, "robust": None}
+
+
+@pytest.mark.parametrize("axes,degree", [(2, 3), (3, 2), (2, 1)])
+def test_variance_equals_dense_inverse(axes, degree):
+    knots, blocks = blocks_of(axes, degree)
+    system = System(knots, axes, list(blocks.values()), 0.3)
+    eye = torch.eye(system.unknowns, dtype=torch.float64)
+    a = torch.stack([system.matvec(column) for column in eye], dim=1)
+    inverse = torch.linalg.inv(a.T @ a + 0.09 * eye).view(knots.nodes, axes, knots.nodes, axes)
+    factor = solve_direct(PreparedSystem(system))[1]
+    points = torch.rand(30, axes, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    points = points * torch.tensor(knots.spacing).double() * torch.tensor(knots.cells)
+    points = points + torch.tensor(knots.origin).double()
+    cell, t = knots.locate(points)
+    points = points[torch.isin(knots.cell_number(cell), system.cells())]
+    cell, t = knots.locate(points)
+    basis = torch.zeros(len(points), knots.nodes, dtype=torch.float64)
+    basis.scatter_(1, knots.local_nodes(cell), knots.stencil(t))
+    expected = torch.einsum("ni,icjc,nj->nc", basis, inverse, basis)
+    assert len(points) > 10
+    assert torch.allclose(Posterior(factor, 4.0, axes).variance(points), expected / 4.0, rtol=1e-9)
+
+
+def test_z_scores_on_data_simulated_from_the_model():
+    """Fields drawn from the prior, noisy samples of them: (fit - truth) / std has standard deviation 1."""
+    generator = torch.Generator().manual_seed(0)
+    points = torch.rand(800, 3, generator=generator, dtype=torch.float64) * 15e-3
+    options = Smoother(divergence=5e-3, curvature=1.5e-3, damping=0.05, wall=None, no_slip=None, **SMALL)
+    data = FitData.checked(points, torch.zeros_like(points), None, None, None, None, 1.0)
+    knots = knots_for(data, 3e-3, None, 3)
+    noise = 0.2
+    precision = len(points) / noise**2
+    blocks = build_system(options, knots, data)
+    silent = blocks.blocks[0].with_weight(0.0)
+    prior = PreparedSystem(System(knots, 3, [silent, *blocks.blocks[1:]], blocks.damping))
+    z = []
+    for _ in range(6):
+        draw = prior.factor().sample(precision, generator)
+        truth = torch.zeros(knots.nodes, 3, dtype=torch.float64)
+        truth[prior.ordering.nodes] = draw
+        cell, t = knots.locate(points)
+        exact = torch.einsum("nl,nlc->nc", knots.stencil(t), truth[knots.local_nodes(cell)])
+        measured = exact + noise * torch.randn(exact.shape, generator=generator, dtype=torch.float64)
+        field = options.fit(points, measured, uncertainty=True)
+        z.append((field(points) - exact) / field.std(points))
+    assert float(torch.cat(z).std()) == pytest.approx(1.0, abs=0.1)
+
+
+def test_z_scores_with_everything_chosen_from_the_data():
+    """A smooth divergence-free flow, white noise of unlike components, outliers, no parameter told."""
+    generator = torch.Generator().manual_seed(1)
+    points = torch.rand(3000, 3, generator=generator, dtype=torch.float64) * 20e-3
+    x, y, z = (150 * points).unbind(1)
+    exact = torch.stack([torch.sin(y) + torch.cos(z), torch.sin(z + 1), torch.cos(x) + torch.sin(y)], dim=1)
+    level = torch.tensor([0.3, 0.3, 0.1], dtype=torch.float64)
+    measured = exact + level * torch.randn(exact.shape, generator=generator, dtype=torch.float64)
+    hops = torch.rand(3000, generator=generator) < 0.02
+    measured[hops] += 5.0
+    field = Smoother().fit(points, measured, uncertainty=True)
+    assert torch.allclose(torch.tensor(field.choice.noise).double(), level, rtol=0.15)
+    assert float(field.choice.robust[hops].max()) == 0 and float(field.choice.robust[~hops].mean()) > 0.8
+    inner = ((points > 3e-3) & (points < 17e-3)).all(1)
+    score = ((field(points) - exact) / field.std(points))[inner]
+    # one smooth flow is smoother than the prior's typical draw: the deviations err on the safe side
+    assert 0.6 < float(score.square().mean().sqrt()) < 1.1
+
+
+def test_std_needs_a_posterior_and_is_masked():
+    points = torch.rand(100, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64) * 1e-2
+    options = Smoother(**SMALL)
+    with pytest.raises(InvalidInput, match="uncertainty"):
+        options.fit(points, points).std(points)
+    field = options.fit(points, points, uncertainty=True)
+    assert torch.isnan(field.std(points + 1.0)).all() and (field.std(points) >= 0).all()
+    with pytest.raises(InvalidInput, match="uncertainty"):
+        Smoother(solver="lsqr", divergence=None, **SMALL).fit(points, points, uncertainty=True)
