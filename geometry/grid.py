@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn.functional import embedding_bag
 
 OUTSIDE = ("clamp", "zero")
 
@@ -133,13 +134,12 @@ class Grid:
         last = place.new_tensor([count - 1 for count in reversed(self.shape)])
         place = torch.minimum(place.clamp(min=0), last)
         lower = torch.minimum(place.detach().floor(), (last - 1).clamp(min=0))
-        fraction = place - lower
-        low = lower.long()
-        high = torch.minimum(low + 1, last.long())
-        index, weight = self._corners(low, high, fraction)
+        # A point that is not finite gets the first node's number and weights that are not finite either.
+        first = (lower.nan_to_num(0.0).long() * self._strides(place)).sum(dim=-1, keepdim=True)
+        weight = self._weights(place - lower)
         if outside == "zero":
             weight = weight * self.contains(points).unsqueeze(-1)
-        return Stencil(index, weight)
+        return Stencil(first + self._offsets(place), weight)
 
     def sample(self, field: Tensor, points: Tensor | Stencil, *, outside: str = "clamp") -> Tensor:
         """Multilinear interpolation of `field (*lead, *shape)` at points: `(*lead, n)`.
@@ -150,14 +150,12 @@ class Grid:
         """
         lead = self._lead(field)
         stencil = points if isinstance(points, Stencil) else self.stencil(points, outside=outside)
-        batch = self._batch(stencil, lead)
-        flat = field.reshape(*lead, self.size)
-        result = 0.0
-        # One corner at a time: a gather of all 2^D at once would need 2^D times the memory.
-        for corner in range(stencil.index.shape[-1]):
-            index, weight = (self._broadcast(part[..., corner], batch, lead) for part in stencil)
-            result = result + flat.gather(-1, index) * weight.to(flat.dtype)
-        return result
+        batch, count, index, weight = self._flat(stencil, lead)
+        # Node after node with its components side by side: the order in which the look-up reads memory.
+        rows = field.reshape(batch, -1, self.size).transpose(1, 2).reshape(batch * self.size, -1)
+        rows = rows.contiguous()  # a single field comes as a view, which the look-up reads much slower
+        result = embedding_bag(index, rows, per_sample_weights=weight.to(rows.dtype), mode="sum")
+        return result.reshape(batch, count, -1).transpose(1, 2).reshape(*lead, count)
 
     def spread(self, values: Tensor, points: Tensor | Stencil, *, outside: str = "clamp") -> Tensor:
         """The exact adjoint of `sample`: `values (*lead, n)` added to the nodes around: `(*lead, *shape)`.
@@ -166,16 +164,17 @@ class Grid:
         """
         lead = tuple(values.shape[:-1])
         stencil = points if isinstance(points, Stencil) else self.stencil(points, outside=outside)
-        batch = self._batch(stencil, lead)
         if values.ndim == 0 or values.shape[-1] != stencil.index.shape[-2]:
             raise ValueError(
                 f"Grid.spread: {tuple(values.shape)} values for {stencil.index.shape[-2]} points"
             )
-        flat = values.new_zeros(*lead, self.size)
-        for corner in range(stencil.index.shape[-1]):
-            index, weight = (self._broadcast(part[..., corner], batch, lead) for part in stencil)
-            flat = flat.scatter_add(-1, index, values * weight.to(values.dtype))
-        return flat.reshape(*lead, *self.shape)
+        batch, count, index, weight = self._flat(stencil, lead)
+        rows = values.reshape(batch, -1, count).transpose(1, 2).reshape(batch * count, -1)
+        total = values.new_zeros(batch * self.size, rows.shape[1])
+        # One corner at a time: all 2^D at once would need 2^D times the memory.
+        for corner in range(index.shape[1]):
+            total = total.index_add(0, index[:, corner], rows * weight[:, corner, None].to(rows.dtype))
+        return total.reshape(batch, self.size, -1).transpose(1, 2).reshape(*lead, *self.shape)
 
     def refined(self, spacing: float | Sequence[float]) -> Grid:
         """A grid of another spacing (m) from the same origin that covers the same box."""
@@ -186,14 +185,35 @@ class Grid:
         origin = tuple(start - nodes * step for start, step in zip(self.origin, self.spacing, strict=True))
         return Grid(origin, self.spacing, tuple(count + 2 * nodes for count in self.shape))
 
-    def _corners(self, low: Tensor, high: Tensor, fraction: Tensor) -> Stencil:
+    def _strides(self, like: Tensor) -> Tensor:
+        """Flat distance of neighbours along x, y, z; 0 along an axis of a single node."""
         strides = [math.prod(self.shape[self.dimension - axis :]) for axis in range(self.dimension)]
-        index, weight = [], []
-        for corner in product((0, 1), repeat=self.dimension):
-            index.append(sum((high if up else low)[..., a] * strides[a] for a, up in enumerate(corner)))
-            factors = [fraction[..., a] if up else 1 - fraction[..., a] for a, up in enumerate(corner)]
-            weight.append(torch.stack(factors).prod(dim=0))
-        return Stencil(torch.stack(index, dim=-1), torch.stack(weight, dim=-1))
+        single = [count == 1 for count in reversed(self.shape)]
+        numbers = [0 if alone else stride for stride, alone in zip(strides, single, strict=True)]
+        return torch.tensor(numbers, device=like.device)
+
+    def _offsets(self, like: Tensor) -> Tensor:
+        """Flat distance of the 2^D corners of a cell from its first one, x changing slowest."""
+        corners = torch.tensor(list(product((0, 1), repeat=self.dimension)), device=like.device)
+        return (corners * self._strides(like)).sum(dim=1)
+
+    @staticmethod
+    def _weights(fraction: Tensor) -> Tensor:
+        """Weights `(..., 2^D)` of the corners for places `(..., D)` in a cell, in the order of `_offsets`."""
+        weights = [torch.ones_like(fraction[..., 0])]
+        for part in fraction.unbind(dim=-1):
+            weights = [weight * factor for weight in weights for factor in (1 - part, part)]
+        return torch.stack(weights, dim=-1)
+
+    def _flat(self, stencil: Stencil, lead: tuple[int, ...]) -> tuple[int, int, Tensor, Tensor]:
+        """Fields with points of their own, points of each, and node numbers and weights in one list."""
+        axes = tuple(stencil.index.shape[:-2])
+        if lead[: len(axes)] != axes:
+            raise ValueError(f"Grid: points with batch {axes} do not fit leading axes {lead}")
+        batch, (count, corners) = math.prod(axes), stencil.index.shape[-2:]
+        shift = self.size * torch.arange(batch, device=stencil.index.device)
+        index = stencil.index.reshape(batch, -1) + shift[:, None]
+        return batch, count, index.reshape(-1, corners), stencil.weight.reshape(-1, corners)
 
     def _check_points(self, points: Tensor) -> None:
         if points.ndim < 2 or points.shape[-1] != self.dimension:
@@ -207,15 +227,3 @@ class Grid:
                 f"Grid.sample: the field's last axes must be {self.shape}, not {tuple(field.shape)}"
             )
         return tuple(field.shape[: field.ndim - self.dimension])
-
-    @staticmethod
-    def _batch(stencil: Stencil, lead: tuple[int, ...]) -> tuple[int, ...]:
-        batch = tuple(stencil.index.shape[:-2])
-        if lead[: len(batch)] != batch:
-            raise ValueError(f"Grid: points with batch {batch} do not fit leading axes {lead}")
-        return batch
-
-    @staticmethod
-    def _broadcast(part: Tensor, batch: tuple[int, ...], lead: tuple[int, ...]) -> Tensor:
-        count = part.shape[-1]
-        return part.reshape(*batch, *(1,) * (len(lead) - len(batch)), count).expand(*lead, count)

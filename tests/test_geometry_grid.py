@@ -92,6 +92,13 @@ def test_float32_stays_float32() -> None:
     torch.testing.assert_close(single.double(), grid.sample(field, points), atol=2e-5, rtol=0)
 
 
+def test_points_that_are_not_finite_give_values_that_are_not() -> None:
+    grid = GRIDS[0]
+    points = torch.tensor([[float("nan"), 2.1, 0.6], [0.0, 2.1, 0.6]], dtype=torch.float64)
+    values = grid.sample(torch.ones(grid.shape, dtype=torch.float64), points)
+    assert values.isnan().tolist() == [True, False]
+
+
 def test_an_axis_of_one_node_is_constant_along_it() -> None:
     grid = Grid((0.0, 0.0, 0.0), (1.0, 1.0, 1.0), (1, 2, 2))
     field = torch.arange(4.0, dtype=torch.float64).reshape(1, 2, 2)
