@@ -17,6 +17,7 @@ from torchsph.assimilation import (
     crps,
     desroziers,
     effective_size,
+    filter_figure,
     rank_histogram,
     replace_failed,
     spread_skill,
@@ -168,3 +169,17 @@ def test_replacements_have_the_survivors_mean_and_covariance():
 def test_a_dead_ensemble_is_an_error():
     with pytest.raises(AssimilationError, match="only 1 of 3"):
         replace_failed(draws(3, 2), torch.tensor([False, True, True]), torch.Generator())
+
+
+def test_figure_shows_what_the_record_holds(tmp_path):
+    figure = filter_figure(cycles(10.0).summary())
+    assert "overconfident" in figure.get_suptitle()
+    labels = [
+        text.get_text() for axes in figure.axes if axes.get_legend() for text in axes.get_legend().texts
+    ]
+    assert {"error, forecast", "jet", "missing", "used"} <= set(labels)
+    bars = figure.axes[1].patches
+    assert sum(bar.get_height() for bar in bars) == pytest.approx(1) and len(bars) == 31
+    figure.savefig(tmp_path / "filter.png")
+    assert (tmp_path / "filter.png").stat().st_size > 10_000
+    assert filter_figure(FilterRecord().summary()).get_suptitle() == ""

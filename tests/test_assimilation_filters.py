@@ -5,6 +5,7 @@ import torch
 
 from torchsph.assimilation import (
     ETKF,
+    RTPS,
     AssimilationError,
     ErrorSubspace,
     Multiplicative,
@@ -118,6 +119,43 @@ def test_stochastic_filter_is_the_gain_with_perturbed_observations():
     gain = covariance @ operator.T @ torch.linalg.inv(inner)
     expected = ensemble + (observations.value + noise - ensemble @ operator.T) @ gain.T
     assert torch.allclose(analysis.ensemble, expected, atol=1e-10)
+
+
+def test_etkf_has_the_symmetric_square_root():
+    """Members, not only moments: the transform of Hunt et al. 2007, eqs. 21-24, in N x N matrices."""
+    ensemble, operator, observations = problem(6)
+    mean = ensemble.mean(0)
+    observed = (ensemble - mean) @ operator.T
+    inverse = 5 * torch.eye(6, dtype=torch.float64) + (observed / observations.variance) @ observed.T
+    value, vector = torch.linalg.eigh(torch.linalg.inv(inverse))
+    root = (vector * (5 * value).sqrt()) @ vector.T
+    shift = torch.linalg.solve(
+        inverse, observed @ ((observations.value - operator @ mean) / observations.variance)
+    )
+    expected = mean + (root + shift) @ (ensemble - mean)
+    analysis = ETKF().analyse(ensemble, ensemble @ operator.T, observations)
+    assert torch.allclose(analysis.ensemble, expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("make", [ETKF, lambda: ETKF(inflation=(RTPS(0.3), Multiplicative(1.1)))])
+def test_filters_do_not_care_about_order_or_units(make):
+    ensemble, operator, observations = problem(6)
+    predicted = ensemble @ operator.T
+    plain = make().analyse(ensemble, predicted, observations).ensemble
+    members, order = torch.tensor([3, 0, 5, 1, 4, 2]), torch.tensor([4, 2, 0, 1, 3])
+    turned = make().analyse(
+        ensemble[members],
+        predicted[members][:, order],
+        Observations(observations.value[order], observations.variance[order]),
+    )
+    assert torch.allclose(turned.ensemble, plain[members], atol=1e-12)
+    unit = torch.tensor([1e-3, 1.0, 1e3, 7.0, 1e-6]).double()
+    scaled = make().analyse(
+        ensemble * 1e-3,
+        predicted * unit,
+        Observations(observations.value * unit, observations.variance * unit**2),
+    )
+    assert torch.allclose(scaled.ensemble, plain * 1e-3, atol=1e-14)
 
 
 def test_rotation_keeps_mean_and_covariance():

@@ -13,6 +13,7 @@ from torchsph.assimilation import (
     Symmetric,
     UnscentedFilter,
     chi2_band,
+    draw_ensemble,
     draw_points,
     nees,
 )
@@ -50,6 +51,16 @@ def test_rules_have_the_moments_they_claim(rule, rank):
     back = rule.gather(draw_points(subspace, rule))
     assert torch.allclose(back.mean, subspace.mean, atol=1e-12)
     assert torch.allclose(back.covariance(), subspace.covariance(), atol=1e-12)
+
+
+@pytest.mark.parametrize("size", [3, 5, 9])
+def test_drawn_ensembles_have_the_moments_exactly(size):
+    subspace = ErrorSubspace(double(6), double(4, 6, seed=1), 0.5 * torch.eye(4, dtype=torch.float64))
+    ensemble = draw_ensemble(subspace, size, torch.Generator().manual_seed(0))
+    other = draw_ensemble(subspace, size, torch.Generator().manual_seed(1))
+    assert torch.allclose(ensemble.mean(0), subspace.mean, atol=1e-12)
+    assert torch.allclose(torch.cov(ensemble.T), subspace.truncated(size - 1).covariance(), atol=1e-12)
+    assert (ensemble - other).abs().max() > 0.1
 
 
 @pytest.mark.parametrize("alpha", [0.1, 0.5, 1.0])

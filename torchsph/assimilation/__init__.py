@@ -20,6 +20,7 @@ from .enkf import StochasticEnKF
 from .errors import AssimilationError
 from .etkf import ETKF
 from .failures import Repaired, Replacement, replace_failed
+from .figure import filter_figure
 from .filters import Analysis, EnsembleFilter, Filter, GlobalTransform, Transform, check_ensemble
 from .hybrid import HybridGain
 from .inflation import RTPP, RTPS, Adaptive, Inflation, Multiplicative
@@ -29,7 +30,7 @@ from .observations import Observations, Reason, Screened, concatenate, count_rea
 from .record import FilterRecord
 from .reduced_unscented import ReducedUnscented
 from .rotation import random_rotation
-from .sigma import SigmaPoints, Simplex, Symmetric, draw_points
+from .sigma import SigmaPoints, Simplex, Symmetric, draw_ensemble, draw_points
 from .smoother import FixedLagSmoother
 from .subspace import ErrorSubspace, update_weights, zero_sum_basis
 from .unscented import UnscentedFilter, UnscentedUpdate
@@ -75,8 +76,10 @@ __all__ = [
     "count_reasons",
     "crps",
     "desroziers",
+    "draw_ensemble",
     "draw_points",
     "effective_size",
+    "filter_figure",
     "gaspari_cohn",
     "gaussian_correlation",
     "nees",

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from .errors import AssimilationError
+from .rotation import random_rotation
 from .subspace import ErrorSubspace, zero_sum_basis
 
 
@@ -113,6 +114,20 @@ def draw_points(subspace: ErrorSubspace, rule: SigmaPoints) -> Tensor:
     """`(*batch, N, n)` float64 sigma points of a subspace."""
     _, coordinate = rule.rule(subspace.rank, subspace.modes.device)
     return subspace.mean.unsqueeze(-2) + coordinate @ subspace.square_root()
+
+
+def draw_ensemble(subspace: ErrorSubspace, size: int, generator: torch.Generator) -> Tensor:
+    """`(*batch, N, n)` float64 members of equal weight, drawn at random with exactly this mean and
+    covariance.
+
+    The second-order exact sampling of Pham (2001, Mon. Wea. Rev. 129, 1194): sample mean and covariance
+    (divisor N - 1) are those of the subspace, or of its N - 1 leading components where its rank is larger.
+    """
+    root = subspace.truncated(size - 1).modes
+    basis = zero_sum_basis(size, device=root.device)
+    batch = tuple(root.shape[:-2])
+    mixed = random_rotation(size, generator, batch=batch, device=root.device) @ basis
+    return subspace.mean.double().unsqueeze(-2) + (size - 1) ** 0.5 * mixed @ root
 
 
 def _unit(mean: Tensor, modes: Tensor) -> ErrorSubspace:
