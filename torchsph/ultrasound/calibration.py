@@ -19,19 +19,30 @@ LEAST_VARIANCE = 1e-8  # (m/s)^2: 0.1 mm/s; below it the squares of errors would
 
 
 @dataclass(frozen=True)
+class VarianceModel:
+    """log variance = features . coefficients, held within ``lowest`` and ``highest``: what the fit has seen."""
+
+    coefficients: tuple[float, ...]
+    lowest: float
+    highest: float
+
+    def variance(self, table: Tensor) -> Tensor:
+        """(n,), (m/s)^2, from features (n, K)."""
+        return (table @ table.new_tensor(self.coefficients)).clamp(self.lowest, self.highest).exp()
+
+
+@dataclass(frozen=True)
 class Calibration:
-    """Log-linear models of the error variance, of components across and along the beam.
+    """Variance models of components across and along the beam; ``reference``: total deviation, m/s, of weight 1/2."""
 
-    lateral, axial: coefficients on :func:`features`. reference: total standard deviation (m/s) of weight 1/2.
-    """
-
-    lateral: tuple[float, ...]
-    axial: tuple[float, ...]
+    lateral: VarianceModel
+    axial: VarianceModel
     reference: float
 
     def sigma(self, estimates: Estimates, beam: Tensor) -> Tensor:
         """Standard deviation (n, D), m/s, of the estimates; ``beam`` (n, D) unit vectors."""
-        lateral, axial = (torch.exp(self._log_variance(estimates, beam, part)) for part in (False, True))
+        lateral = self.lateral.variance(features(estimates, beam, False))
+        axial = self.axial.variance(features(estimates, beam, True))
         along = beam.square()
         return (lateral[:, None] * (1 - along) + axial[:, None] * along).sqrt()
 
@@ -39,10 +50,6 @@ class Calibration:
         """Confidence (n,) in [0, 1], falling with the fitted deviation; 0 where an estimate is flagged."""
         total = self.sigma(estimates, beam).square().sum(1)
         return torch.where(estimates.accepted, 1 / (1 + total / self.reference**2), 0)
-
-    def _log_variance(self, estimates: Estimates, beam: Tensor, axial: bool) -> Tensor:
-        table = features(estimates, beam, axial)
-        return table @ table.new_tensor(self.axial if axial else self.lateral)
 
 
 def features(estimates: Estimates, beam: Tensor, axial: bool) -> Tensor:
@@ -74,8 +81,10 @@ def fit_calibration(estimates: Estimates, error: Tensor, beam: Tensor) -> Calibr
         share = along if axial else (1 - along) / max(beam.shape[1] - 1, 1)
         square = (error.square() * share).sum(1).clamp_min(LEAST_VARIANCE)
         table = features(estimates, beam, axial)[kept].double().cpu().numpy()
-        parts.append(_fit_log_variance(table, square[kept].double().cpu().numpy()))
-    model = Calibration(tuple(parts[0].tolist()), tuple(parts[1].tolist()), 1.0)
+        coefficients = _fit_log_variance(table, square[kept].double().cpu().numpy())
+        lowest, highest = np.quantile(table @ coefficients, (0.02, 0.98))
+        parts.append(VarianceModel(tuple(coefficients.tolist()), float(lowest), float(highest)))
+    model = Calibration(parts[0], parts[1], 1.0)
     total = model.sigma(estimates, beam)[kept].square().sum(1).median().sqrt()
     return Calibration(model.lateral, model.axial, float(total))
 

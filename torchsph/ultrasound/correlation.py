@@ -50,7 +50,9 @@ def gather(volume: Tensor, corner: Tensor, size: tuple[int, int, int]) -> Tensor
     return blocks.view(size[0], len(corner), size[1], size[2], images)
 
 
-def correlate(volume: Tensor, corner: Tensor, offset: Tensor, apart: int, shape: KernelShape) -> Tensor:
+def correlate(
+    volume: Tensor, corner: Tensor, offset: Tensor, apart: int, shape: KernelShape, *, ramp: Tensor | None = None
+) -> Tensor:
     """Normalised complex correlation (P, Lz, Ly, Lx) of images ``apart`` images from each other, pooled over pairs.
 
     ``volume`` (Z, Y, X, T) complex. ``corner`` (P, 3): first node of each kernel; ``offset`` (P, 3): lag in the
@@ -58,9 +60,13 @@ def correlate(volume: Tensor, corner: Tensor, offset: Tensor, apart: int, shape:
 
         rho(s) = sum conj(a) b / sqrt(sum |a|^2 sum |b|^2),  sums over t and k,
 
-    so |rho| <= 1. Zero where either has no energy. The caller pads the volume so that all blocks fit.
+    so |rho| <= 1. Zero where either has no energy. The caller pads the volume so that all blocks fit. ``ramp``
+    (P, 3), rad per node and image: how the echoes' turn between images changes along each axis; a kernel's nodes
+    are turned back to its middle by it, so that axial shear does not make their products cancel.
     """
     kernel = gather(volume, corner, shape.size)[..., :-apart]
+    if ramp is not None:
+        kernel = kernel * _ramp_phasors(ramp * apart, shape)
     region = gather(volume, corner + offset - corner.new_tensor(shape.search), shape.region)[..., apart:]
     product = _lag_products(kernel, region, shape)
     kernel_energy = kernel.abs().square().sum((0, 2, 3, 4))
@@ -69,6 +75,15 @@ def correlate(volume: Tensor, corner: Tensor, offset: Tensor, apart: int, shape:
     norm = (kernel_energy[:, None, None, None] * region_energy).sqrt()
     tiny = torch.finfo(norm.dtype).tiny ** 0.5
     return torch.where(norm > tiny, product / norm.clamp_min(tiny), 0)
+
+
+def _ramp_phasors(ramp: Tensor, shape: KernelShape) -> Tensor:
+    """exp(i ramp . node) over a kernel, (kz, P, ky, kx, 1), nodes counted from its middle."""
+    phase = torch.zeros((), dtype=ramp.dtype, device=ramp.device)
+    for axis, view in enumerate(((-1, 1, 1, 1, 1), (1, 1, -1, 1, 1), (1, 1, 1, -1, 1))):
+        node = torch.arange(-shape.half[axis], shape.half[axis] + 1, dtype=ramp.dtype, device=ramp.device)
+        phase = phase + node.view(view) * ramp[:, axis].view(1, -1, 1, 1, 1)
+    return torch.polar(torch.ones_like(phase), phase)
 
 
 def _lag_products(kernel: Tensor, region: Tensor, shape: KernelShape) -> Tensor:
