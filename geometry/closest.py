@@ -79,8 +79,7 @@ class SurfaceIndex:
         return self._result(points, face, self._faces.closest(points, face)[1])
 
     def _result(self, points: np.ndarray, face: np.ndarray, weights: np.ndarray) -> Closest:
-        # Measured afresh from the point itself: the search compares squares, which lose digits close to the
-        # surface.
+        # Measured afresh from the point itself: the search compares squares, which lose digits when small.
         where = np.einsum("nk,nkd->nd", weights, self.surface.vertices[self.surface.faces[face]])
         return Closest(np.sqrt(((points - where) ** 2).sum(1)), face, weights)
 

@@ -77,8 +77,7 @@ def _banded(grid: Grid, index: SurfaceIndex, nodes: np.ndarray, near: np.ndarray
     exact = index.query(nodes[rows])
     number = np.zeros(grid.size, np.int64)
     number[rows] = np.arange(len(rows))
-    # Every node takes over the face of the nearest node in the band (itself, in the band) and measures its
-    # own distance.
+    # Every node measures its distance from the face of the nearest node in the band, there itself.
     options = {"sampling": grid.spacing[::-1], "return_distances": False, "return_indices": True}
     nearest = distance_transform_edt(~near, **options)
     source = number[np.ravel_multi_index(tuple(nearest), grid.shape).ravel()]

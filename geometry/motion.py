@@ -57,8 +57,7 @@ class WallMotion:
         if rates is not None:
             rates = rates.astype(np.float64)
         period = recording.period
-        # Frames closer to the end of the period than a tenth of the last step would make a key interval of no
-        # length.
+        # A frame within a tenth of a step of the period's end is taken as that end.
         if period and time[-1] < time[0] + period - 0.1 * (time[-1] - time[-2]):
             time = np.append(time, time[0] + period)
             vertices = np.concatenate([vertices, vertices[:1]])

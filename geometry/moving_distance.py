@@ -140,8 +140,8 @@ class MovingDistance:
         surface = self.motion.surface(time)
         distance, closest = distance_and_closest(self.grid, surface, band=self.band)
         velocity = closest.interpolate(surface, self.motion.velocity(time))
-        # On the surface itself the direction to the closest point is lost in round-off; the face's normal is
-        # right there.
+        # On the surface the direction to the closest point is lost in round-off, but the face's normal is
+        # right.
         nodes = self.grid.nodes().numpy()
         towards = nodes - closest.point(surface)
         flat = distance.reshape(-1, 1)

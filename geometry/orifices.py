@@ -11,13 +11,11 @@ from functools import cached_property
 
 import numpy as np
 import torch
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from .motion import WallMotion
 from .repair import rims
-from .surface import SurfaceError
+from .surface import SurfaceError, pieces_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,19 +138,11 @@ def orifices(motion: WallMotion) -> list[Orifice]:
     found = []
     for label in np.unique(motion.region[motion.region > 0]):
         faces = np.flatnonzero(motion.region == label)
-        piece = _pieces(motion.faces[faces], motion.vertices_at_keys.shape[1])
+        piece = pieces_of(motion.faces[faces], motion.vertices_at_keys.shape[1])
         for number in range(piece.max() + 1):
             part = faces[piece == number]
             found.append(Orifice(motion, int(label), part, _rim_edges(motion.faces[part], int(label))))
     return found
-
-
-def _pieces(faces: np.ndarray, count: int) -> np.ndarray:
-    """Number of the connected piece of each face."""
-    start = np.repeat(faces[:, 0], faces.shape[1] - 1)
-    graph = coo_array((np.ones(len(start), np.int8), (start, faces[:, 1:].ravel())), shape=(count, count))
-    label = connected_components(graph, directed=False)[1][faces[:, 0]]
-    return np.unique(label, return_inverse=True)[1]
 
 
 def _rim_edges(faces: np.ndarray, label: int) -> np.ndarray:

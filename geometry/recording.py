@@ -140,7 +140,7 @@ class Recording:
     def select(self, frames: slice | Sequence[int] | np.ndarray) -> Recording:
         """Some of the frames, in increasing order of time: a slice, frame numbers or a bool for each frame.
 
-        The period is kept only where all frames are, because the rest no longer spans it evenly.
+        The period stays what it is: frames left out do not change the motion that they sample.
         """
         chosen = np.arange(self.frames)[frames if isinstance(frames, slice) else np.asarray(frames)]
         changes: dict[str, object] = {"wall": self.wall.select(chosen)}

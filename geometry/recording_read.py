@@ -12,8 +12,7 @@ from .recording import LAYOUT, REQUIRED, Recording, Wall
 from .recording_rules import RecordingError
 
 ELSEWHERE = "in another file, which is never followed; copy the data into this file"
-# HDF5 filter numbers: deflate (gzip), shuffle, fletcher32 and lzf. Others would load code from plug-ins on
-# the machine.
+# HDF5 filters: deflate (gzip), shuffle, fletcher32, lzf. Others would load code from plug-ins.
 FILTERS = {1, 2, 3, 32000}
 SOFT_LINKS = 16  # a chain longer than this is a circle
 

@@ -24,6 +24,10 @@ class RecordingError(ValueError):
         super().__init__(f"{source}: {dataset}: {rule}")
         self.source, self.dataset, self.rule = source, dataset, rule
 
+    def __reduce__(self) -> tuple[type, tuple[str, str, str]]:
+        """Errors cross processes by pickling, which would hand the whole message to `source`."""
+        return type(self), (self.source, self.dataset, self.rule)
+
 
 def check(recording: Recording, source: str = "recording") -> None:
     """Raise RecordingError for the first rule that is broken; `source`, say the file, opens the message."""
@@ -182,8 +186,7 @@ def _wall(recording: Recording, source: str) -> None:
         first.check()
     except SurfaceError as fault:
         raise RecordingError(source, "/wall/faces", str(fault)) from fault
-    # Closedness is a matter of the faces alone; only the orientation has to be looked at again in later
-    # frames.
+    # Closedness is a matter of the faces alone; only the orientation may change in later frames.
     sense = np.sign(first.component_volumes)
     for frame in range(1, recording.frames if wall.moves else 1):
         surface = Surface(wall.vertices[frame], wall.faces, wall.region)

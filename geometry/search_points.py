@@ -8,6 +8,8 @@ import numpy as np
 
 from .surface import Surface
 
+MOST = 200_000
+
 
 class SearchPoints(NamedTuple):
     """Points `(n, D)`, m; the faces around point i are `owners[first[i] : first[i + 1]]`.
@@ -23,7 +25,10 @@ class SearchPoints(NamedTuple):
 
 
 def search_points(surface: Surface, longest: np.ndarray, step: float) -> SearchPoints:
-    """Search points at most `step` (m) apart on edges; `longest` (nf,) is the longest edge of each face."""
+    """Search points about `step` (m) apart on edges; `longest` (nf,) is the longest edge of each face."""
+    large = longest > step
+    # However coarse a mesh is, a search gains nothing from more points than this.
+    step = max(step, float(np.sqrt((longest[large] ** 2).sum() / MOST)))
     # Powers of two, so that the points on an edge belong to the lattices of the faces on both of its sides.
     cuts = 2 ** np.ceil(np.log2(np.maximum(longest / step, 1))).astype(np.int64)
     used, place = np.unique(surface.faces, return_inverse=True)

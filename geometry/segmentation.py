@@ -165,8 +165,7 @@ class _Simplices:
         inner = self.moved[self.corners[row, corner]] - first
         along = self.moved[faces[:, 1:]] - first[:, None]
         volume = np.linalg.det(np.concatenate([along, inner[:, None]], axis=1))
-        # In a plane the body lies to the left of an edge; in space it lies behind a face seen
-        # counter-clockwise.
+        # In a plane the body lies to the left of an edge, in space behind a face seen counter-clockwise.
         turn = volume < 0 if count == 3 else volume > 0
         faces[turn] = faces[turn][:, ::-1]
         return faces

@@ -57,8 +57,7 @@ def box(lower: Sequence[float], upper: Sequence[float], spacing: float) -> Surfa
             quads = quads if side else quads[:, ::-1]
             points.append(lattice)
             faces.append(quads[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3))
-    # The sides were made one by one; integer lattice coordinates tell exactly which of their vertices
-    # coincide.
+    # The sides were made one by one; lattice coordinates tell exactly which of their vertices coincide.
     lattice, place = np.unique(np.concatenate(points), axis=0, return_inverse=True)
     return Surface(lower + lattice / count * size, place.reshape(-1)[np.concatenate(faces)])
 

@@ -125,12 +125,7 @@ class Surface:
     @cached_property
     def component_labels(self) -> np.ndarray:
         """Number of the connected piece that each face belongs to, `(nf,)`."""
-        count = len(self.vertices)
-        links = [np.stack([self.faces[:, 0], self.faces[:, k]]) for k in range(1, self.dimension)]
-        row, column = np.concatenate(links, axis=1)
-        graph = coo_array((np.ones(len(row), np.int8), (row, column)), shape=(count, count))
-        label = connected_components(graph, directed=False)[1][self.faces[:, 0]]
-        return np.unique(label, return_inverse=True)[1]
+        return pieces_of(self.faces, len(self.vertices))
 
     @property
     def component_volumes(self) -> np.ndarray:
@@ -218,6 +213,14 @@ class Surface:
             a, b = unit(corner[:, (k + 1) % 3] - corner[:, k]), unit(corner[:, (k + 2) % 3] - corner[:, k])
             result.append(np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), (a * b).sum(1)))
         return result
+
+
+def pieces_of(faces: np.ndarray, count: int) -> np.ndarray:
+    """Number of the connected piece of each face `(nf,)`; `count` vertices are numbered."""
+    start = np.repeat(faces[:, 0], faces.shape[1] - 1)
+    graph = coo_array((np.ones(len(start), np.int8), (start, faces[:, 1:].ravel())), shape=(count, count))
+    label = connected_components(graph, directed=False)[1][faces[:, 0]]
+    return np.unique(label, return_inverse=True)[1]
 
 
 def ridges_of(faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:

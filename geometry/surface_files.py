@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-import trimesh
 
 from .repair import repaired
 from .surface import Surface, SurfaceError
+
+if TYPE_CHECKING:
+    import trimesh
 
 SUFFIXES = (".stl", ".obj", ".ply")
 LARGEST = 1.0  # m; hearts are smaller, so a larger surface is in mm or cm
@@ -80,6 +83,8 @@ def labelled(
 
 
 def _load(path: Path) -> trimesh.Trimesh:
+    import trimesh  # half a second that most uses of the package need not wait
+
     options = {"skip_materials": True} if path.suffix.lower() == ".obj" else {}
     try:
         mesh = trimesh.load_mesh(path, process=False, **options)

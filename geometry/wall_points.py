@@ -39,10 +39,8 @@ class WallSampler:
 
     def __init__(self, motion: WallMotion, spacing: float, *, smooth_angle: float = 40.0) -> None:
         if not spacing > 0 or not 0 <= smooth_angle < 90:
-            text = (
-                f"WallSampler: needs spacing > 0 and 0 <= smooth_angle < 90, not {spacing} and {smooth_angle}"
-            )
-            raise ValueError(text)
+            given = f"{spacing} and {smooth_angle}"
+            raise ValueError(f"WallSampler: needs spacing > 0 and 0 <= smooth_angle < 90, not {given}")
         self.motion = motion
         surface = motion.surface(float(motion.time[0]))
         owner, weights = _cut(surface, spacing)
@@ -52,8 +50,7 @@ class WallSampler:
         area = share * surface.areas[owner]
         mean = (area / np.bincount(group, weights=area)[group])[:, None] * weights
         rows = np.repeat(group, surface.dimension)
-        # Points and velocities as means over vertices, area vectors as sums over faces: linear maps, made
-        # once.
+        # Points and velocities are means over vertices, area vectors sums over faces: linear maps, made once.
         self._mean = _sparse(mean, rows, surface.faces[owner], (count, len(surface.vertices)))
         self._sum = _sparse(share, group, owner, (count, faces))
         self._corners = self._blend = None
@@ -91,8 +88,7 @@ def _cut(surface: Surface, spacing: float) -> tuple[np.ndarray, np.ndarray]:
         place = (number + 0.5) / pieces[owner]
         return owner, np.stack([1 - place, place], axis=1)
     sides = np.stack([corner[:, (k + 1) % 3] - corner[:, k] for k in range(3)], axis=1)
-    # A triangle of side s has the area 0.43 s^2: about 1.8 spacings on the longest side leave no place
-    # farther than a spacing from a point.
+    # With 1.8 spacings on the longest side no place is farther than a spacing from a centroid.
     cuts = np.maximum(np.ceil(np.sqrt((sides**2).sum(2)).max(1) / (1.8 * spacing) - 0.1), 1).astype(np.int64)
     owner, weights = [], []
     for n in np.unique(cuts):
@@ -108,8 +104,7 @@ def _gather(surface: Surface, owner: np.ndarray, weights: np.ndarray, spacing: f
     size = (surface.areas / np.bincount(owner, minlength=len(surface.faces)))[owner]
     small = size < 0.4 * spacing ** (surface.dimension - 1)
     box = np.floor((where - where.min(axis=0)) / spacing).astype(np.int64)
-    # Which axis the normal follows most, and in which sense: faces around a sharp edge must not share a
-    # normal.
+    # Which axis the normal follows most, and in which sense: faces around a sharp edge must not be mixed.
     normal = surface.normals[owner]
     axis = np.abs(normal).argmax(axis=1)
     facing = 2 * axis + (np.take_along_axis(normal, axis[:, None], axis=1)[:, 0] > 0)

@@ -61,8 +61,7 @@ def grid_winding(grid: Grid, vertices: np.ndarray, faces: np.ndarray) -> np.ndar
     crossing = _segment_crossings if dimension == 2 else _triangle_crossings
     counts = tuple(reversed(grid.shape[1:]))
     line, height, sign = crossing(place, vertices[:, -1], faces, counts)
-    # A crossing at height z concerns the nodes below it: count it on the last such node and sum upwards down
-    # the line.
+    # A crossing concerns the nodes below it: count it at the highest of them and sum down the line.
     level = np.ceil((height - grid.origin[-1]) / grid.spacing[-1]).astype(np.int64) - 1
     hit = level >= 0
     level = np.minimum(level, grid.shape[0] - 1)
@@ -80,8 +79,7 @@ def _segment_crossings(place, height, faces, counts):
     segment, line = _ranges(first, stop)
     fraction = (line - start[segment]) / (end - start)[segment]
     h0, h1 = height[faces[segment, 0]], height[faces[segment, 1]]
-    # Counter-clockwise around the inside: an upper side runs towards -x, and there the line leaves the
-    # inside.
+    # Counter-clockwise around the inside, an upper side runs towards -x: there the line leaves the inside.
     return line, h0 + fraction * (h1 - h0), np.sign(start - end)[segment]
 
 

@@ -150,8 +150,7 @@ def test_a_box_that_moves_several_spacings_between_frames_stays_exact(frames: in
         wall = moving.at(t).at(points)
         low = speed * t
         expected = _box_distance(points.numpy(), low, low + 1)
-        # Grids are made wherever the wall has moved one spacing, which keeps the error at a few percent of
-        # it.
+        # Grids are made wherever the wall has moved one spacing: the error stays at a few percent of it.
         np.testing.assert_allclose(wall.distance, expected, atol=0.03)
         np.testing.assert_allclose(wall.velocity, np.broadcast_to(speed, (3, 3)), atol=1e-9)
     assert max(moving._pieces) == int(np.ceil(0.8 / (frames - 1) / 0.1))

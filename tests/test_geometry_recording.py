@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import pickle
 from collections.abc import Callable
 from pathlib import Path
 
@@ -379,6 +380,11 @@ def test_valve_changes_are_derived_midway_between_frames(box_recording: Callable
     assert box_recording(_flow).valve_intervals_or_derived().shape == (0, 3)
     given = box_recording(_flow, valve_open=[[0, 0]] * 3, valve_intervals=[[1, 0.0, 0.01]])
     np.testing.assert_array_equal(given.valve_intervals_or_derived(), [[1, 0.0, 0.01]])
+
+
+def test_errors_survive_pickling() -> None:
+    error = pickle.loads(pickle.dumps(RecordingError("a.h5", "/time", "must increase")))
+    assert str(error) == "a.h5: /time: must increase" and error.dataset == "/time"
 
 
 def test_public_names_are_all_there() -> None:

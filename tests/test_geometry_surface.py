@@ -73,8 +73,7 @@ def test_normals_point_outwards_and_area_vectors_close() -> None:
 
 
 def test_vertex_normals_do_not_depend_on_how_a_side_is_cut() -> None:
-    # At the corner of a cube two or one triangles may meet a side; the angle weights make all sides count the
-    # same.
+    # At the corner of a cube one or two triangles of a side may meet; the angles make all sides count alike.
     cube = box((0, 0, 0), (1, 1, 1), 1.0)
     expected = np.sign(cube.vertices - 0.5) / np.sqrt(3)
     np.testing.assert_allclose(cube.vertex_normals, expected, atol=1e-14)
@@ -172,8 +171,7 @@ def test_grid_winding_counts_overlaps_and_meshes_that_sit_on_the_nodes() -> None
     nodes = grid.nodes().numpy()
     expected = (nodes < 1).all(1).astype(int) + (nodes > 0.5).all(1)
     np.testing.assert_array_equal(winding.ravel(), expected)
-    # Grid lines through the edges and vertices of the mesh: inside must still come out the same on both
-    # sides.
+    # Grid lines through the edges and vertices of the mesh must still be counted once.
     aligned = Grid((-0.25, -0.25, 0.125), (0.25, 0.25, 0.25), (4, 8, 8))
     inside = grid_winding(aligned, first.vertices, first.faces)
     lateral = aligned.nodes().numpy()[:, :2]
