@@ -16,6 +16,7 @@ from .diagnostics import (
     rank_histogram,
     spread_skill,
 )
+from .distributed import Distributed, gather_members, member_slice
 from .enkf import StochasticEnKF
 from .errors import AssimilationError
 from .etkf import ETKF
@@ -44,6 +45,7 @@ __all__ = [
     "Analysis",
     "AssimilationError",
     "Augmentation",
+    "Distributed",
     "EnsembleFilter",
     "ErrorSubspace",
     "Filter",
@@ -81,7 +83,9 @@ __all__ = [
     "effective_size",
     "filter_figure",
     "gaspari_cohn",
+    "gather_members",
     "gaussian_correlation",
+    "member_slice",
     "nees",
     "random_rotation",
     "rank_histogram",

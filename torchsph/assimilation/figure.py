@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -59,10 +60,9 @@ def _ranks(axes: Axes, counts: list[int] | None) -> None:
 
 def _innovations(axes: Axes, cycles: list[dict]) -> None:
     for name in cycles[0]["innovations"] if cycles else ():
-        points = [(cycle["time"], cycle["innovations"][name]["ratio"]) for cycle in cycles]
-        points = [(time, ratio) for time, ratio in points if ratio is not None]
-        if points:
-            axes.plot(*zip(*points, strict=True), label=name, marker=".", ms=3)
+        ratios = [cycle["innovations"][name]["ratio"] for cycle in cycles]
+        shown = [math.nan if ratio is None else ratio for ratio in ratios]
+        axes.plot([cycle["time"] for cycle in cycles], shown, label=name, marker=".", ms=3)
     axes.axhline(1, color="k", lw=1)
     axes.set(xlabel="time (s)", ylabel="RMS of normalised innovations", ylim=(0, None))
     if axes.lines[1:]:
