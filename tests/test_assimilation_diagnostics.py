@@ -2,11 +2,13 @@
 
 import json
 import math
+import textwrap
 
 import pytest
 import torch
 from scipy.stats import norm
 
+from torchsph import assimilation
 from torchsph.assimilation import (
     ETKF,
     AssimilationError,
@@ -183,3 +185,25 @@ def test_figure_shows_what_the_record_holds(tmp_path):
     figure.savefig(tmp_path / "filter.png")
     assert (tmp_path / "filter.png").stat().st_size > 10_000
     assert filter_figure(FilterRecord().summary()).get_suptitle() == ""
+
+
+def test_the_packages_example_runs():
+    """The lines in the package's docstring, with a small model in the place of a large one."""
+    code = textwrap.dedent(assimilation.__doc__.split("\n\n")[2])
+    draw = torch.Generator().manual_seed(0)
+    nodes = torch.rand(20, 3, generator=draw) * 0.02
+    names = {
+        **vars(assimilation),
+        "value": torch.randn(60, generator=draw),
+        "variance": torch.ones(60),
+        "nodes": nodes,
+        "grid": nodes,
+        "times": (0.0, 0.01, 0.02),
+        "model": lambda ensemble: 1.1 * ensemble,
+        "operator": lambda ensemble: ensemble,
+        "ensemble": torch.randn(6, 60, generator=draw),
+        "record": FilterRecord(),
+    }
+    exec(code, names)
+    assert len(names["record"].cycles) == 3
+    assert names["analysis"].spread_after < 1

@@ -128,6 +128,47 @@ def test_periodic_domain_has_no_seam(patch):
     assert torch.allclose(analyse(0), analyse(4), atol=1e-12)
 
 
+def test_radius_per_dimension_is_a_stretched_domain():
+    ensemble, predicted, observations, place = field()
+    stretch = torch.tensor([1.0, 2.0], dtype=torch.float64)
+    plain = LETKF(localisation=Localisation(2.5), patch=None)
+    isotropic = plain.analyse(ensemble, predicted, observations, state_positions=place)
+    tall = Observations(observations.value, observations.variance, observations.position * stretch)
+    oblong = LETKF(localisation=Localisation((2.5, 5.0)), patch=None)
+    result = oblong.analyse(ensemble, predicted, tall, state_positions=place * stretch)
+    assert torch.allclose(result.ensemble, isotropic.ensemble, atol=1e-12)
+
+
+def test_channel_periodic_in_one_direction():
+    """Moving everything along the periodic direction, out of the box, changes nothing; across does."""
+    ensemble, predicted, observations, place = field()
+    ring = LETKF(localisation=Localisation(2.5, period=(6.0, torch.inf)), patch=0.4)
+    results = []
+    for observed_shift in ((0.0, 0.0), (-12.0, 0.0), (0.0, 6.0)):
+        moved = Observations(
+            observations.value,
+            observations.variance,
+            observations.position + torch.tensor(observed_shift, dtype=torch.float64),
+        )
+        results.append(ring.analyse(ensemble, predicted, moved, state_positions=place).ensemble)
+    assert torch.allclose(results[0], results[1], atol=1e-10)
+    assert (results[0] - results[2]).abs().max() > 0.1
+    turned = torch.where(torch.arange(2) == 0, (place + 40 * 6.0), place)
+    again = ring.analyse(ensemble, predicted, observations, state_positions=turned).ensemble
+    assert torch.allclose(results[0], again, atol=1e-9)
+
+
+def test_float32_sums_are_given_up_for_very_precise_observations():
+    ensemble, predicted, observations, place = field()
+    exact = Observations(observations.value, observations.variance * 1e-9, observations.position)
+    letkf = LETKF(localisation=Localisation(2.5), patch=None)
+    single = letkf.analyse(ensemble.float(), predicted.float(), exact, state_positions=place)
+    double = letkf.analyse(
+        ensemble.float().double(), predicted.float().double(), exact, state_positions=place
+    )
+    assert torch.allclose(single.ensemble.double(), double.ensemble, atol=1e-3)
+
+
 def test_far_observations_are_named():
     ensemble, predicted, observations, place = field()
     moved = observations.places.clone()

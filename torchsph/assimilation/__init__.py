@@ -2,6 +2,18 @@
 
 An ensemble is `(*batch, N, n)`; `predicted (*batch, N, m)` is the observation operator applied to it. Every
 filter here is a `Filter`: `analyse(ensemble, predicted, observations, ...) -> Analysis`.
+
+    seen = Observations(value, variance, position=nodes)              # NaN: missing; m = 3 * len(nodes)
+    letkf = LETKF(localisation=Localisation(0.01), inflation=RTPS(0.5), gross_error=4.0)
+    for time in times:
+        ensemble = model(ensemble)                                    # any model that moves (N, n)
+        analysis = letkf.analyse(ensemble, operator(ensemble), seen, state_positions=grid)
+        record.add(time, analysis, seen)                              # what to believe, and warnings in words
+        ensemble = analysis.ensemble
+
+Conventions: inflation factors multiply standard deviations; a localisation radius is where influence ENDS; a
+component-major field of vectors gives the position of each node once; random numbers come from an explicit
+`torch.Generator`; the algebra of the ensemble is float64 whatever the precision of the state.
 """
 
 from .augmented import Augmentation, Parameter

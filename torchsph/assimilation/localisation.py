@@ -111,6 +111,9 @@ class PatchGrid:
     def share(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """`(k, 2^D)` flat node indices and multilinear weights (summing to one) of `points (k, D)`."""
         place = (points - self.origin) / self.spacing
+        count = torch.tensor(self.shape, dtype=torch.float64, device=points.device)
+        wraps = torch.tensor(self.periodic, device=points.device)
+        place = torch.where(wraps, place - torch.floor(place / count) * count, place)
         last = torch.tensor(
             [n - 1 if wraps else max(n - 2, 0) for n, wraps in zip(self.shape, self.periodic, strict=True)],
             device=points.device,
