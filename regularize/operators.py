@@ -13,7 +13,7 @@ import torch
 from .errors import InvalidInput
 from .knots import Knots
 
-CHUNK = 16384  # points per pass: bounds the (points, local_size, C) buffers to tens of megabytes
+CHUNK = 4096  # points per pass: bounds the (points, local_size, C) buffers to a few megabytes
 
 
 class RowBlock(Protocol):

@@ -11,7 +11,7 @@ from .krylov import Solution
 from .likelihood import Choice
 from .operators import System
 from .posterior import Posterior
-from .rows import FitData
+from .samples import FitData
 
 
 @dataclass(frozen=True)

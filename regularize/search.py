@@ -7,8 +7,9 @@ import torch
 from .knots import Knots
 from .likelihood import Choice, Groups, LikelihoodSearch
 from .operators import CellRows, VectorRows
-from .penalties import curvature_gram, row_factor
-from .rows import FitData, penalty_blocks, wall_roots
+from .penalties import row_factor
+from .rows import penalty_blocks, smoothness_gram, wall_roots
+from .samples import FitData
 
 if TYPE_CHECKING:
     from .smoother import Smoother
@@ -33,7 +34,7 @@ def choose(options: "Smoother", knots: Knots, data: FitData) -> Choice | None:
     if options.no_slip and data.wall is not None and bool(data.wall.no_slip.any()):
         wall, held = data.wall, data.wall.no_slip
         slip = VectorRows(coarse, wall.points[held], wall.velocity[held], wall_roots(wall)[held, None])
-    factor = row_factor(curvature_gram(coarse, range(coarse.axes))) / data.extent(coarse) ** 0.5
+    factor = row_factor(smoothness_gram(options, coarse, data)) / data.extent(coarse) ** 0.5
     groups = Groups(
         data.points, data.velocity, data.weight, CellRows(coarse, cells, factor, 1), slip, blocks, damping
     )

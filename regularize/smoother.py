@@ -27,7 +27,8 @@ from .operators import System
 from .pcg import pcg
 from .problem import Problem
 from .robust import CUTOFFS
-from .rows import FitData, build_system, knots_for
+from .rows import build_system, knots_for
+from .samples import FitData
 from .search import choose
 from .sparse import sparse_operators
 from .walls import WallRows
@@ -43,11 +44,13 @@ class Smoother:
     """Options of the spline fit; ``None`` switches a part off. See the module's text for the units.
 
     ``knots``: knot distance in m (or one per axis); ``nodes`` instead fixes the coefficients per axis,
-    longest side first (table 4.1: 32, 16, 16). ``power``: samples' rows are multiplied by weight ** power.
-    ``automatic="likelihood"`` chooses curvature, no_slip and the noise of each velocity component from the
-    data (see ``likelihood``); the values given here are then the first guess, and are kept where fewer than
-    30 samples, or samples of no flow, leave nothing to choose from (``field.choice`` is None there).
-    ``robust``: "tukey" or "huber" reweighting of outliers, found together with that choice.
+    longest side first (table 4.1: 32, 16, 16). ``time_knots`` (s): knot distance along the time, for points
+    with a time column; ``time_curvature`` (s) adds time_curvature^4 <|d^2 v / dt^2|^2> to the cost and keeps
+    its ratio to curvature where that is chosen automatically. ``power``: samples' rows are multiplied by
+    weight ** power. ``automatic="likelihood"`` chooses curvature, no_slip and the noise of each velocity
+    component from the data (see ``likelihood``); the values given here are then the first guess, and are
+    kept where fewer than 30 samples, or samples of no flow, leave nothing to choose from (``field.choice``
+    is None there). ``robust``: "tukey" or "huber" reweighting of outliers, found together with that choice.
     ``search_knots``: the choice is made on a grid this many times coarser, in at most ``rounds`` rounds.
     ``solver``: "direct" (what "auto" picks), "lsqr", "lsmr", or "pcg" with a neighbouring frame's factor;
     ``sparse``: the iterative ones store the matrix and its transpose instead of applying rows.
@@ -56,11 +59,13 @@ class Smoother:
 
     knots: float | tuple[float, ...] | None = 3e-3
     nodes: tuple[int, ...] | None = None
+    time_knots: float | None = None
     degree: int = 3
     divergence: float | None = 30e-3
     wall: float | None = 2.0
     no_slip: float | None = 0.5
     curvature: float | None = 1e-3
+    time_curvature: float | None = 10e-3
     damping: float | None = 1e-3
     power: float = 1.0
     automatic: str | None = "likelihood"
@@ -78,7 +83,7 @@ class Smoother:
             raise InvalidInput("give exactly one of knots (a distance in m) and nodes (a count per axis)")
         if self.nodes is not None and min(self.nodes) <= self.degree:
             raise InvalidInput(f"nodes is {self.nodes}: each axis needs more than degree = {self.degree}")
-        for name in ("divergence", "wall", "no_slip", "curvature", "damping"):
+        for name in ("divergence", "wall", "no_slip", "curvature", "time_curvature", "damping"):
             value = getattr(self, name)
             if value is not None and not 0 <= value < float("inf"):
                 raise InvalidInput(f"{name} is {value}: it must be finite and >= 0, or None to switch it off")
@@ -138,11 +143,14 @@ class Smoother:
         *,
         divergence_points: torch.Tensor | None = None,
         box: tuple[Sequence[float], Sequence[float]] | None = None,
+        beam: torch.Tensor | None = None,
         uncertainty: bool = False,
         neighbour: SplineField | None = None,
     ) -> SplineField:
         """Fit samples velocity (n, D) in m/s at points (n, D) in m with confidences weight (n,) in [0, 1].
 
+        Points (n, D + 1) carry the time in s last; walls, divergence points and the field's arguments then do
+        too. ``beam`` (n, D) or (D,): unit vectors along which alone the samples know the velocity.
         ``wall``: rows on walls and valves. ``divergence_points`` (m, D): where the divergence is penalised
         (and the field counts as supported); absent: over every knot cell that holds samples or wall.
         ``box``: lower and upper corner of the knot grid (default: around all points); give the same one for
@@ -151,7 +159,10 @@ class Smoother:
         first frame, and one too unlike its neighbour, are solved directly). Samples of zero weight are
         ignored and may be NaN. Raises InvalidInput for bad input, NotConverged when the solver fails.
         """
-        data = FitData.checked(points, velocity, weight, wall, divergence_points, box, self.power)
+        where = (divergence_points, box, self.power)
+        data = FitData.checked(points, velocity, weight, wall, *where, beam=beam)
+        if beam is not None and self.automatic:
+            raise InvalidInput("automatic choice needs full vectors: use fixed(...) for samples along a beam")
         problem = self._problem(data)
         if self.solver == "pcg" and neighbour is not None:
             solution, factor = self._with_neighbour(problem.system, neighbour)
@@ -187,13 +198,15 @@ class Smoother:
         return problem.solve_all([data.velocity for data in every], self.tolerance)
 
     def _problem(self, data: FitData) -> Problem:
-        knots = knots_for(data, self.knots, self.nodes, self.degree)
+        knots = knots_for(data, self)
         options, choice = self, None
         if self.automatic == "likelihood":
             choice = choose(self, knots, data)
             options = self.fixed()
         if choice is not None:
-            options = self.fixed(curvature=choice.curvature, no_slip=choice.no_slip)
+            stretch = choice.curvature / self.curvature
+            in_time = None if self.time_curvature is None else stretch * self.time_curvature
+            options = self.fixed(curvature=choice.curvature, time_curvature=in_time, no_slip=choice.no_slip)
             data = data.reweighed(choice)
         return Problem(data, build_system(options, knots, data), choice)
 

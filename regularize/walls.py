@@ -33,7 +33,8 @@ class WallRows:
         convert = {"points": points}
         for name in ("normals", "velocity"):
             value = torch.as_tensor(getattr(self, name)).to(points)
-            if value.shape != points.shape:
+            # points may carry the time as one more column than the vectors have
+            if value.ndim != 2 or len(value) != len(points) or points.shape[1] - value.shape[1] not in (0, 1):
                 raise InvalidInput(
                     f"wall {name} have shape {tuple(value.shape)}: expected {tuple(points.shape)}"
                 )

@@ -4,7 +4,8 @@ import pytest
 import torch
 
 from regularize import InvalidInput, NotConverged, PreparedSystem, Smoother, pcg
-from regularize.rows import FitData, build_system, knots_for
+from regularize.rows import build_system, knots_for
+from regularize.samples import FitData
 
 OPTIONS = Smoother(automatic=None, robust=None, divergence=10e-3)
 BOX = ((0.0, 0.0, 0.0), (12e-3, 12e-3, 15e-3))
@@ -58,7 +59,7 @@ def test_pcg_reports_non_convergence():
     systems = []
     for seed in (0, 1):
         data = FitData.checked(*frame(seed), None, None, BOX, 1.0)
-        systems.append(PreparedSystem(build_system(OPTIONS, knots_for(data, 3e-3, None, 3), data)))
+        systems.append(PreparedSystem(build_system(OPTIONS, knots_for(data, OPTIONS), data)))
     with pytest.raises(NotConverged, match="solve directly"):
         pcg(systems[1], systems[0].factor(), tolerance=1e-12, max_iterations=2)
 

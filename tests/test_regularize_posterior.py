@@ -5,7 +5,8 @@ import torch
 from regularize_cases import blocks_of
 
 from regularize import InvalidInput, Posterior, PreparedSystem, Smoother, System, solve_direct
-from regularize.rows import FitData, build_system, knots_for
+from regularize.rows import build_system, knots_for
+from regularize.samples import FitData
 
 SMALL = {"automatic": None, "robust": None}
 
@@ -37,7 +38,7 @@ def test_z_scores_on_data_simulated_from_the_model():
     points = torch.rand(800, 3, generator=generator, dtype=torch.float64) * 15e-3
     options = Smoother(divergence=5e-3, curvature=1.5e-3, damping=0.05, wall=None, no_slip=None, **SMALL)
     data = FitData.checked(points, torch.zeros_like(points), None, None, None, None, 1.0)
-    knots = knots_for(data, 3e-3, None, 3)
+    knots = knots_for(data, options)
     noise = 0.2
     precision = len(points) / noise**2
     blocks = build_system(options, knots, data)
