@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -108,7 +109,14 @@ class WallMotion:
 
     def surface(self, t: float) -> Surface:
         """The surface at time `t`."""
-        return Surface(self.vertices(t), self.faces, self.region)
+        return self._first.moved(self.vertices(t))
+
+    @cached_property
+    def _first(self) -> Surface:
+        """The surface of the first key frame, which knows what all others share."""
+        surface = Surface(self.vertices_at_keys[0], self.faces, self.region)
+        _ = surface.is_closed, surface.component_labels
+        return surface
 
     def volume(self, t: float) -> float:
         """Enclosed volume at time `t`, m^3 (area, m^2, in a plane)."""

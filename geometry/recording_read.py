@@ -22,7 +22,8 @@ def read_recording(path: str | Path) -> Recording:
 
     Raises FileNotFoundError where there is no file, and RecordingError, which names the file, the dataset,
     the rule and what to do, where it is not a recording or breaks one of the rules. External links, external
-    storage and virtual datasets are refused. The velocity comes back as 0 outside the mask.
+    storage and virtual datasets are refused. The velocity comes back as 0 outside the mask, and may be NaN
+    where the weight is 0.
     """
     path = Path(path)
     if not path.is_file():
@@ -79,18 +80,20 @@ def _header(file: h5py.File, source: str) -> int:
         raise RecordingError(
             source, "attribute format", f'must be "recording", not {_text(file, "format")!r}'
         )
-    version = file.attrs.get("format_version")
-    if version is None or np.ndim(version) or version != 1:
-        rule = f"must be 1, the version this reader knows, not {version}"
+    version = _number(file, "format_version", source)
+    if version != 1:
+        rule = f"must be 1, the version this reader knows, not {version:g}"
         raise RecordingError(source, "attribute format_version", rule)
-    dimension = file.attrs.get("dimension", 3)
-    if np.ndim(dimension) or dimension not in (2, 3):
-        raise RecordingError(source, "attribute dimension", f"must be 2 or 3, not {dimension}")
+    dimension = _number(file, "dimension", source) if "dimension" in file.attrs else 3
+    if dimension not in (2, 3):
+        raise RecordingError(source, "attribute dimension", f"must be 2 or 3, not {dimension:g}")
     return int(dimension)
 
 
 def _text(file: h5py.File, name: str) -> str:
     value = file.attrs.get(name, "")
+    if isinstance(value, np.ndarray) and value.size == 1:  # as some writers store a single string
+        value = value.reshape(-1)[0]
     return value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)
 
 

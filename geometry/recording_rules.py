@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .surface import Surface, SurfaceError
+from .surface import SurfaceError
 
 if TYPE_CHECKING:
     from .recording import Recording
@@ -189,7 +189,7 @@ def _wall(recording: Recording, source: str) -> None:
     # Closedness is a matter of the faces alone; only the orientation may change in later frames.
     sense = np.sign(first.component_volumes)
     for frame in range(1, recording.frames if wall.moves else 1):
-        surface = Surface(wall.vertices[frame], wall.faces, wall.region)
+        surface = first.moved(wall.vertices[frame])
         if (np.sign(surface.component_volumes) != sense).any():
             rule = f"the surface is inside out at frame {frame}, but not at frame 0"
             raise RecordingError(source, "/wall/vertices", rule)

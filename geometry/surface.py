@@ -120,7 +120,7 @@ class Surface:
     @cached_property
     def volume(self) -> float:
         """Enclosed volume, m^3 (area, m^2, in a plane); negative where the surface is inside out."""
-        return float(self.component_volumes.sum())
+        return float(self._volume_shares().sum())
 
     @cached_property
     def component_labels(self) -> np.ndarray:
@@ -130,10 +130,7 @@ class Surface:
     @property
     def component_volumes(self) -> np.ndarray:
         """Signed volume of each connected piece, m^3 (m^2 in a plane)."""
-        # Measured from the middle of the box: far from the origin the terms would cancel badly.
-        offset = self.vertices[self.faces[:, 0]] - self.vertices[self.faces.ravel()].mean(0)
-        share = (self.area_vectors * offset).sum(1) / self.dimension
-        return np.bincount(self.component_labels, weights=share)
+        return np.bincount(self.component_labels, weights=self._volume_shares())
 
     @cached_property
     def open_ridges(self) -> int:
@@ -182,7 +179,12 @@ class Surface:
 
     def moved(self, vertices: np.ndarray) -> Surface:
         """The same faces and regions at other vertex positions `(nv, D)`, m."""
-        return replace(self, vertices=vertices)
+        result = replace(self, vertices=vertices)
+        # What depends on the faces alone, and has been found out already, holds for the moved surface too.
+        for name in ("component_labels", "open_ridges", "twisted_ridges"):
+            if name in self.__dict__ and len(result.vertices) == len(self.vertices):
+                result.__dict__[name] = self.__dict__[name]
+        return result
 
     def part(self, region: int) -> np.ndarray:
         """Numbers of the faces that carry a region label."""
@@ -197,6 +199,12 @@ class Surface:
         return trimesh.Trimesh(
             self.vertices, self.faces, face_attributes={"region": self.region}, process=False
         )
+
+    def _volume_shares(self) -> np.ndarray:
+        """Volume of the cone over each face, `(nf,)`, from a common tip."""
+        # The tip is the middle of the vertices: far from the surface the terms would cancel badly.
+        offset = self.vertices[self.faces[:, 0]] - self.vertices[self.faces.ravel()].mean(0)
+        return (self.area_vectors * offset).sum(1) / self.dimension
 
     def _ridges(self) -> tuple[np.ndarray, np.ndarray]:
         """For each edge (vertex in a plane): passes forward minus backward, and all passes."""

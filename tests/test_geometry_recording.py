@@ -95,6 +95,14 @@ def test_static_mask_and_wall_serve_every_frame(path: Path, full: Recording) -> 
     assert back.wall.at(2).volume == pytest.approx(full.wall.at(0).volume)
 
 
+def test_attributes_of_one_element_and_byte_strings_are_read(path: Path, full: Recording) -> None:
+    with h5py.File(path, "r+") as file:
+        file.attrs["format"] = np.bytes_("recording")
+        file.attrs["description"] = np.array([b"a box"])
+        file.attrs["format_version"], file.attrs["rho"] = np.array([1]), np.array([full.rho])
+    _assert_equal(full, read_recording(path))
+
+
 def test_nan_is_allowed_where_the_weight_is_zero_and_outside_the_mask(path: Path) -> None:
     with h5py.File(path, "r+") as file:
         weight, velocity, mask = file["weight"][()], file["velocity"][()], file["mask"][()].astype(bool)
@@ -208,6 +216,7 @@ RULES: list[tuple[str, Callable[[h5py.File], None], str]] = [
     ("no format", _attribute("/", "format", None), 'attribute format: must be "recording"'),
     ("version", _attribute("/", "format_version", 2), "attribute format_version: must be 1"),
     ("dimension", _attribute("/", "dimension", 4), "attribute dimension: must be 2 or 3"),
+    ("no version", _attribute("/", "format_version", None), "attribute format_version: is required"),
     ("no rho", _attribute("/", "rho", None), "attribute rho: is required"),
     ("rho 0", _attribute("/", "rho", 0.0), "attribute rho: must be a positive density"),
     ("mu negative", _attribute("/", "mu", -1.0), "attribute mu: must be finite and not negative"),

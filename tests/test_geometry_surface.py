@@ -64,6 +64,13 @@ def test_volume_does_not_depend_on_the_place() -> None:
     assert far.volume == pytest.approx(SPHERE.volume, rel=1e-9)
 
 
+def test_a_moved_surface_is_judged_by_its_own_vertices() -> None:
+    SPHERE.check()
+    with pytest.raises(SurfaceError, match="inside out"):
+        SPHERE.moved(SPHERE.vertices * np.array([1, 1, -1])).check()
+    assert SPHERE.moved(2 * SPHERE.vertices).volume == pytest.approx(8 * SPHERE.volume, rel=1e-12)
+
+
 def test_normals_point_outwards_and_area_vectors_close() -> None:
     assert (SPHERE.normals * SPHERE.centroids).sum(1).min() > 0.9
     assert (SPHERE.vertex_normals * SPHERE.vertices).sum(1).min() > 0.999
