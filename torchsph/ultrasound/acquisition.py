@@ -15,8 +15,8 @@ from geometry import Grid
 class Acquisition:
     """Timing and wave of an acquisition.
 
-    frequency: centre frequency, Hz. sound_speed: m/s. prf: image repetition frequency, Hz. packet: images taken
-    in a row of one velocity estimate.
+    frequency: centre frequency, Hz. sound_speed: m/s. prf: image repetition frequency, Hz. packet: images
+    taken in a row of one velocity estimate.
     """
 
     frequency: float = 5e6
@@ -50,7 +50,8 @@ class Acquisition:
 
 @dataclass(frozen=True)
 class Beams:
-    """Where the beams point: parallel along ``direction``, or fanning out from ``apex`` (then it is not used).
+    """Where the beams point: parallel along ``direction``, or fanning out from ``apex`` (then it is not
+    used).
 
     direction: D numbers, made a unit vector, in which sound leaves the probe. apex: D numbers, m.
     """
@@ -88,9 +89,10 @@ class Beams:
 class Packet:
     """IQ samples (T, *shape), complex64 or complex128, of T images on a grid.
 
-    The baseband convention is that of demodulation at the depth of the sample: an echo from depth z carries the
-    phase exp(-i 4 pi f z / c), so motion away from the probe turns the phase backwards. ``noise`` is the power of
-    the thermal noise per sample where it is known (scanners measure it with the transmitter off).
+    The baseband convention is that of demodulation at the depth of the sample: an echo from depth z
+    carries the phase exp(-i 4 pi f z / c), so motion away from the probe turns the phase backwards.
+    ``noise`` is the power of the thermal noise per sample where it is known (scanners measure it with the
+    transmitter off).
     """
 
     iq: Tensor

@@ -1,6 +1,7 @@
 """How far to trust an estimate: standard deviations and weights fitted to what a tracker says of itself.
 
-The fit sees errors of simulations made for it alone, with their own seeds and flows; it is then used on others.
+The fit sees errors of simulations made for it alone, with their own seeds and flows; it is then used on
+others.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ LEAST_VARIANCE = 1e-8  # (m/s)^2: 0.1 mm/s; below it the squares of errors would
 
 @dataclass(frozen=True)
 class VarianceModel:
-    """log variance = features . coefficients, held within ``lowest`` and ``highest``: what the fit has seen."""
+    """log variance = features . coefficients, kept within what the fit has seen."""
 
     coefficients: tuple[float, ...]
     lowest: float
@@ -33,7 +34,7 @@ class VarianceModel:
 
 @dataclass(frozen=True)
 class Calibration:
-    """Variance models of components across and along the beam; ``reference``: total deviation, m/s, of weight 1/2."""
+    """Variance models across and along the beam; ``reference``: total deviation, m/s, of weight 1/2."""
 
     lateral: VarianceModel
     axial: VarianceModel
@@ -53,7 +54,8 @@ class Calibration:
 
 
 def features(estimates: Estimates, beam: Tensor, axial: bool) -> Tensor:
-    """What the log variance is linear in, (n, 5): 1, predicted log variance, log(1 - rho), log peak ratio, dB of SNR.
+    """What the log variance is linear in, (n, 6): 1, predicted log variance, log(1 - rho), log peak ratio,
+    SNR and share of power passed by the clutter filter (both in 10 dB).
 
     All bounded, so that an odd estimate cannot ask for an absurd deviation. An unknown SNR counts as 20 dB.
     """
@@ -63,14 +65,16 @@ def features(estimates: Estimates, beam: Tensor, axial: bool) -> Tensor:
     decorrelation = (1 - estimates.correlation).clamp(1e-4, 1.0).log()
     ratio = estimates.peak_ratio.clamp(1.0, 10.0).log()
     snr = torch.nan_to_num(estimates.snr, nan=20.0).clamp(-10, 40) / 10
-    return torch.stack([torch.ones_like(predicted), predicted, decorrelation, ratio, snr], 1)
+    power = torch.nan_to_num(estimates.power, nan=0.0).clamp(-60, 5) / 10
+    return torch.stack([torch.ones_like(predicted), predicted, decorrelation, ratio, snr, power], 1)
 
 
 def fit_calibration(estimates: Estimates, error: Tensor, beam: Tensor) -> Calibration:
     """Fit to errors (n, D), m/s, of accepted estimates with beams (n, D). Needs at least 50 of them.
 
-    The variance of each class is exp(features . c), with c where the Gaussian likelihood of the errors is highest.
-    Its first equation is mean(error^2 / variance) = 1: outliers count in full, so the z-scores have unit variance.
+    The variance of each class is exp(features . c), with c where the Gaussian likelihood of the errors is
+    highest. Its first equation is mean(error^2 / variance) = 1: outliers count in full, so the z-scores
+    have unit variance.
     """
     kept = estimates.accepted
     if int(kept.sum()) < 50:
@@ -105,7 +109,9 @@ def _fit_log_variance(table: np.ndarray, square: np.ndarray) -> np.ndarray:
         gradient = design.T @ (1 - ratio) + ridge @ coefficients
         hessian = (design * ratio[:, None]).T @ design + ridge
         step = np.linalg.solve(hessian, gradient)
-        step *= min(1.0, 1.0 / max(np.abs(design @ step).max(), 1e-12))  # at most a factor e of variance at a time
+        step *= min(
+            1.0, 1.0 / max(np.abs(design @ step).max(), 1e-12)
+        )  # at most a factor e of variance at a time
         coefficients -= step
         if np.abs(step).max() < 1e-8:
             result = coefficients / scale

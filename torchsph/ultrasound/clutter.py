@@ -1,7 +1,8 @@
 """Clutter filters: what separates blood from bright, slow tissue, along the images of a packet.
 
-Overview and the response of regression filters: Bjaerum, Torp & Kristoffersen, IEEE Trans. Ultrason. Ferroelectr.
-Freq. Control 49, 2002. All filters act on IQ samples (T, *shape) and keep only images that are free of transients.
+Overview and the response of regression filters: Bjaerum, Torp & Kristoffersen, IEEE Trans. Ultrason.
+Ferroelectr. Freq. Control 49, 2002. All filters act on IQ samples (T, *shape) and keep only images that
+are free of transients.
 """
 
 from __future__ import annotations
@@ -31,9 +32,9 @@ class ClutterFilter(Protocol):
 class FIRFilter:
     """Linear-phase high-pass of ``taps`` (odd) coefficients with its cut-off at ``cutoff`` of half the PRF.
 
-    A windowed design does not reject still tissue: firwin(9, .12) passes -5.9 dB at zero frequency. The mean of the
-    coefficients is therefore taken off, which is the least change that puts an exact null there; being symmetric,
-    the response then starts with the square of the frequency.
+    A windowed design does not reject still tissue: firwin(9, .12) passes -5.9 dB at zero frequency. The
+    mean of the coefficients is therefore taken off, which is the least change that puts an exact null
+    there; being symmetric, the response then starts with the square of the frequency.
     """
 
     taps: int = 9
@@ -46,7 +47,7 @@ class FIRFilter:
             raise ValueError(f"cutoff must lie in (0, 1) of half the PRF, got {self.cutoff!r}")
 
     def coefficients(self) -> np.ndarray:
-        """Coefficients (taps,), unit gain at half the PRF, sum zero. Raises ArithmeticError if the null fails."""
+        """Coefficients (taps,), unit gain at half the PRF; ArithmeticError if their sum is not 0."""
         design = firwin(self.taps, self.cutoff, pass_zero=False)
         design = design - design.mean()
         design /= abs(np.sum(design * (-1.0) ** np.arange(self.taps)))
@@ -56,7 +57,9 @@ class FIRFilter:
 
     def apply(self, iq: Tensor) -> Tensor:
         if len(iq) < self.taps:
-            raise ValueError(f"an FIR filter of {self.taps} taps needs as many images, the packet has {len(iq)}")
+            raise ValueError(
+                f"an FIR filter of {self.taps} taps needs as many images, the packet has {len(iq)}"
+            )
         design = self.coefficients()
         valid = len(iq) - self.taps + 1
         filtered = design[-1] * iq[:valid]
@@ -95,7 +98,7 @@ class PolynomialFilter:
         return (flat - basis @ (basis.T @ flat)).reshape(iq.shape)
 
     def response(self, frequency: np.ndarray, images: int = 16) -> np.ndarray:
-        """Mean power response over the packet at ``frequency`` in units of the PRF (Bjaerum 2002, equation 14)."""
+        """Mean power response over the packet at ``frequency`` in units of the PRF (Bjaerum 2002)."""
         wave = np.exp(2j * np.pi * np.asarray(frequency)[:, None] * np.arange(images))
         return 1 - (np.abs(wave.conj() @ self._basis(images)) ** 2).sum(1) / images
 
@@ -105,7 +108,7 @@ class PolynomialFilter:
 
 @dataclass(frozen=True)
 class SVDFilter:
-    """Removes the ``rank`` strongest components of the space-time matrix (Demene et al., IEEE TMI 34, 2015)."""
+    """Removes the ``rank`` strongest components of space-time (Demene et al., IEEE TMI 34, 2015)."""
 
     rank: int = 2
 

@@ -1,8 +1,8 @@
 """Normalised cross-correlation of small kernels between images of a packet, for many points at once.
 
-Kernels of all points of a tile are gathered into a layout in which the sum over images and one space axis is a
-matrix product, so that the search runs at the speed of a batched matrix multiplication. Two axes of lags come from
-slices of the gathered search regions and the third from the diagonals of the products.
+Kernels of all points of a tile are gathered into a layout in which the sum over images and one space axis
+is a matrix product, so that the search runs at the speed of a batched matrix multiplication. Two axes of
+lags come from slices of the gathered search regions and the third from the diagonals of the products.
 """
 
 from __future__ import annotations
@@ -35,7 +35,8 @@ class KernelShape:
 
 
 def gather(volume: Tensor, corner: Tensor, size: tuple[int, int, int]) -> Tensor:
-    """Blocks (sz, P, sy, sx, T) of ``volume`` (Z, Y, X, T) whose first nodes are ``corner`` (P, 3), array order.
+    """Blocks (sz, P, sy, sx, T) of ``volume`` (Z, Y, X, T) whose first nodes are ``corner`` (P, 3), array
+    order.
 
     Whole lines of nodes and images are copied at once: the last two axes of the volume are contiguous.
     """
@@ -51,18 +52,26 @@ def gather(volume: Tensor, corner: Tensor, size: tuple[int, int, int]) -> Tensor
 
 
 def correlate(
-    volume: Tensor, corner: Tensor, offset: Tensor, apart: int, shape: KernelShape, *, ramp: Tensor | None = None
+    volume: Tensor,
+    corner: Tensor,
+    offset: Tensor,
+    apart: int,
+    shape: KernelShape,
+    *,
+    ramp: Tensor | None = None,
 ) -> Tensor:
-    """Normalised complex correlation (P, Lz, Ly, Lx) of images ``apart`` images from each other, pooled over pairs.
+    """Normalised complex correlation (P, Lz, Ly, Lx) of images ``apart`` images from each other, pooled
+    over pairs.
 
-    ``volume`` (Z, Y, X, T) complex. ``corner`` (P, 3): first node of each kernel; ``offset`` (P, 3): lag in the
-    middle of the search, nodes. With a(t, k) the kernel and b(t + apart, k + s) what lies at lag s,
+    ``volume`` (Z, Y, X, T) complex. ``corner`` (P, 3): first node of each kernel; ``offset`` (P, 3): lag
+    in the middle of the search, nodes. With a(t, k) the kernel and b(t + apart, k + s) what lies at lag s,
 
         rho(s) = sum conj(a) b / sqrt(sum |a|^2 sum |b|^2),  sums over t and k,
 
-    so |rho| <= 1. Zero where either has no energy. The caller pads the volume so that all blocks fit. ``ramp``
-    (P, 3), rad per node and image: how the echoes' turn between images changes along each axis; a kernel's nodes
-    are turned back to its middle by it, so that axial shear does not make their products cancel.
+    so |rho| <= 1. Zero where either has no energy. The caller pads the volume so that all blocks fit.
+    ``ramp`` (P, 3), rad per node and image: how the echoes' turn between images changes along each axis; a
+    kernel's nodes are turned back to its middle by it, so that axial shear does not make their products
+    cancel.
     """
     kernel = gather(volume, corner, shape.size)[..., :-apart]
     if ramp is not None:
@@ -71,7 +80,9 @@ def correlate(
     product = _lag_products(kernel, region, shape)
     kernel_energy = kernel.abs().square().sum((0, 2, 3, 4))
     energy = region.abs().square().sum(-1).transpose(0, 1)
-    region_energy = F.avg_pool3d(energy[:, None], shape.size, stride=1)[:, 0] * float(torch.tensor(shape.size).prod())
+    region_energy = F.avg_pool3d(energy[:, None], shape.size, stride=1)[:, 0] * float(
+        torch.tensor(shape.size).prod()
+    )
     norm = (kernel_energy[:, None, None, None] * region_energy).sqrt()
     tiny = torch.finfo(norm.dtype).tiny ** 0.5
     return torch.where(norm > tiny, product / norm.clamp_min(tiny), 0)
@@ -89,8 +100,8 @@ def _ramp_phasors(ramp: Tensor, shape: KernelShape) -> Tensor:
 def _lag_products(kernel: Tensor, region: Tensor, shape: KernelShape) -> Tensor:
     """Sum over images and nodes of conj(kernel) region at every lag, (P, Lz, Ly, Lx) complex.
 
-    kernel (kz, P, ky, kx, T), region (rz, P, ry, rx, T). Real and imaginary parts come from one product with the
-    interleaved samples of the kernel and of i times the kernel.
+    kernel (kz, P, ky, kx, T), region (rz, P, ry, rx, T). Real and imaginary parts come from one product
+    with the interleaved samples of the kernel and of i times the kernel.
     """
     (kz, ky, kx), (lz, ly, lx), (rz, ry, rx) = shape.size, shape.lags, shape.region
     points, images = kernel.shape[1], kernel.shape[-1]

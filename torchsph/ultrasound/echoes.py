@@ -52,13 +52,15 @@ def simulate_packet(
 ) -> Packet:  # fmt: skip
     """IQ images of ``flow`` on ``grid``, centred in time on ``time`` (s), of blood power 1.
 
-    Scatterers are seeded afresh at the first image and reseeded at every following one where they leave or thin
-    out. Runs on the generator's device. Raises ValueError where dimensions disagree.
+    Scatterers are seeded afresh at the first image and reseeded at every following one where they leave or
+    thin out. Runs on the generator's device. Raises ValueError where dimensions disagree.
     """
     if model.beams.dimension != grid.dimension:
         raise ValueError(f"beams are {model.beams.dimension}-D, the grid {grid.dimension}-D")
     acquisition = model.acquisition
-    imager = ParallelImager(grid, model.pointspread, acquisition, model.beams, dtype=dtype, device=generator.device)
+    imager = ParallelImager(
+        grid, model.pointspread, acquisition, model.beams, dtype=dtype, device=generator.device
+    )
     box, density = _box(grid, model), model.density / model.pointspread.energy(grid.dimension)
     start = time - 0.5 * (acquisition.packet - 1) * acquisition.interval
     cloud = seed_cloud(box, flow, start, density, generator, dtype=dtype)

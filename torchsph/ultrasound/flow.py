@@ -31,7 +31,8 @@ class Flow(Protocol):
 class LinearFlow:
     """Blood everywhere, velocity + gradient (x - centre): uniform motion, shear, rotation, at rest in time.
 
-    velocity: D numbers, m/s. gradient: D x D numbers, 1/s, row = component, column = direction; ``None`` = uniform.
+    velocity: D numbers, m/s. gradient: D x D numbers, 1/s, row = component, column = direction; ``None`` =
+    uniform.
     """
 
     at_centre: tuple[float, ...]
@@ -52,9 +53,10 @@ class LinearFlow:
 class RecordingFlow:
     """The motion that a recording holds: blood inside its mask, tissue that follows the nearest wall outside.
 
-    Beyond an orifice (where the nearest vertex belongs to no wall face) the blood goes on with the velocity of the
-    nearest node inside. Multilinear in space and linear in time, so velocity is continuous across the wall.
-    ``margin`` (m) is how far the field reaches beyond the recording's grid; it is constant further out.
+    Beyond an orifice (where the nearest vertex belongs to no wall face) the blood goes on with the
+    velocity of the nearest node inside. Multilinear in space and linear in time, so velocity is continuous
+    across the wall. ``margin`` (m) is how far the field reaches beyond the recording's grid; it is
+    constant further out.
     """
 
     def __init__(
@@ -82,7 +84,7 @@ class RecordingFlow:
         return self._sample(inside, points)[0] > 0.5
 
     def _place(self, time: float) -> tuple[int, float]:
-        """Frame at or before ``time`` and the share of the next one; the first and last frames hold beyond the ends."""
+        """Frame at or before ``time`` and the share of the next; the end frames hold beyond the ends."""
         times = self._recording.time
         if time <= times[0] or len(times) == 1:
             return 0, 0.0
@@ -111,22 +113,28 @@ class RecordingFlow:
         of_wall[surface.faces[surface.region == 0].reshape(-1)] = True
         tissue = of_wall[nearest].reshape(mask.shape) & ~mask
         moving = wall_velocity(recording, frame)[nearest].T.reshape(velocity.shape)
-        inside = distance_transform_edt(~mask, sampling=recording.grid.spacing[::-1], return_distances=False,
-                                        return_indices=True) if mask.any() else np.indices(mask.shape)  # fmt: skip
+        steps = recording.grid.spacing[::-1]
+        inside = np.indices(mask.shape)
+        if mask.any():
+            inside = distance_transform_edt(~mask, steps, return_distances=False, return_indices=True)
         velocity = velocity[(slice(None), *inside)]
         return np.where(tissue, moving, velocity), ~tissue
 
     def _sample(self, field: Tensor, points: Tensor) -> Tensor:
         """Multilinear interpolation of ``field`` (C, *padded) at points (n, D) -> (C, n), clamped outside."""
         lower, upper = points.new_tensor(self.grid.origin), points.new_tensor(self.grid.upper)
-        place = 2 * (points - lower) / (upper - lower) - 1  # the padding leaves at least 3 nodes on every axis
+        place = (
+            2 * (points - lower) / (upper - lower) - 1
+        )  # the padding leaves at least 3 nodes on every axis
         place = place.view(1, len(points), *[1] * (points.shape[1] - 1), points.shape[1])
-        sampled = F.grid_sample(field[None].to(points), place, mode="bilinear", padding_mode="border", align_corners=True)
+        sampled = F.grid_sample(
+            field[None].to(points), place, mode="bilinear", padding_mode="border", align_corners=True
+        )
         return sampled.reshape(field.shape[0], len(points))
 
 
 def wall_velocity(recording: Recording, frame: int) -> np.ndarray:
-    """Velocity (nv, D), m/s, of the wall's vertices at a frame: as recorded, or differenced from the vertices."""
+    """Velocity (nv, D), m/s, of the wall's vertices at a frame: as recorded, or differenced."""
     wall = recording.wall
     if wall.velocity is not None:
         return np.asarray(wall.velocity[frame], np.float64)

@@ -1,9 +1,9 @@
 """Points to a periodic lattice and back without aliasing: gridding with a compact kernel.
 
-The non-uniform Fourier transform with the "exponential of semicircle" kernel of Barnett, Magland & af Klinteberg
-(SIAM J. Sci. Comput. 41, 2019). Each point is spread over a few nodes; dividing the lattice's Fourier transform
-by the kernel's undoes the smearing. What remains is the aliased tail of the kernel: about 1e-3 at four nodes and
-an oversampling of 1.5, falling some tenfold per node.
+The non-uniform Fourier transform with the "exponential of semicircle" kernel of Barnett, Magland & af
+Klinteberg (SIAM J. Sci. Comput. 41, 2019). Each point is spread over a few nodes; dividing the lattice's
+Fourier transform by the kernel's undoes the smearing. What remains is the aliased tail of the kernel:
+about 1e-3 at four nodes and an oversampling of 1.5, falling some tenfold per node.
 """
 
 from __future__ import annotations
@@ -21,10 +21,11 @@ CHUNK = 1 << 14  # points spread at a time: their stencils stay in the cache
 
 @dataclass(frozen=True)
 class Gridding:
-    """A periodic lattice: node (k, j, i) at ``origin + spacing * (i, j, k)``, the box repeats after ``shape`` nodes.
+    """A periodic lattice: node (k, j, i) at ``origin + spacing * (i, j, k)``, the box repeats after
+    ``shape`` nodes.
 
-    width: nodes per axis that a point touches. oversampling: Nyquist frequency of the lattice over the highest
-    frequency that has to be right.
+    width: nodes per axis that a point touches. oversampling: Nyquist frequency of the lattice over the
+    highest frequency that has to be right.
     """
 
     origin: tuple[float, ...]
@@ -51,11 +52,13 @@ class Gridding:
         field = values.new_zeros(math.prod(self.shape))
         for start in range(0, len(points), CHUNK):
             nodes, weights = self._stencil(points[start : start + CHUNK])
-            field.index_add_(0, nodes.reshape(-1), (weights * values[start : start + CHUNK, None]).reshape(-1))
+            field.index_add_(
+                0, nodes.reshape(-1), (weights * values[start : start + CHUNK, None]).reshape(-1)
+            )
         return field.view(self.shape)
 
     def gather(self, field: Tensor, points: Tensor) -> Tensor:
-        """Adjoint of :meth:`spread`: kernel-weighted sums (n,) of ``field`` (*shape) around ``points`` (n, D)."""
+        """Adjoint of :meth:`spread`: weighted sums (n,) of ``field`` (*shape) around ``points`` (n, D)."""
         flat = field.reshape(-1)
         parts = []
         for start in range(0, len(points), CHUNK):
@@ -69,7 +72,7 @@ class Gridding:
         return 2 * math.pi * torch.fft.fftfreq(nodes, step, dtype=like.dtype, device=like.device)
 
     def correction(self, axis: int, like: Tensor) -> Tensor:
-        """Fourier transform (nodes,) of the kernel along an axis, by which the lattice's has to be divided."""
+        """Fourier transform (nodes,) of the kernel along an axis, to divide the lattice's by."""
         place, share = np.polynomial.legendre.leggauss(24 + 2 * self.width)  # to round-off up to Nyquist
         place, share = torch.from_numpy(place), torch.from_numpy(share)
         half = 0.5 * self.width * self.wavenumbers(axis, place) * self.spacing[axis]

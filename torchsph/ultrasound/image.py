@@ -54,7 +54,7 @@ class ParallelImager:
         self._window, self._colour = self._make_windows(pointspread, math.prod(box))
 
     def _make_windows(self, pointspread: PointSpread, volume: float) -> tuple[Tensor, Tensor]:
-        """Point-spread transform over the gridding kernel's, and the noise colour of unit power, both (*lattice)."""
+        """Point-spread transform over the gridding kernel's, and the colour of noise of power 1."""
         dimension = self.grid.dimension
         waves, spread = [], torch.ones((), dtype=self._lower.dtype, device=self._lower.device)
         for axis in range(dimension):
@@ -75,7 +75,9 @@ class ParallelImager:
         points, amplitude = points[near], amplitude[near]
         # depth from the grid's corner keeps the phase small, and so exact in float32; then one common factor
         phase = -self.acquisition.phase_per_metre * self.beams.depth(points - self._lower)
-        spectrum = torch.fft.fftn(self.lattice.spread(points, amplitude * torch.polar(torch.ones_like(phase), phase)))
+        spectrum = torch.fft.fftn(
+            self.lattice.spread(points, amplitude * torch.polar(torch.ones_like(phase), phase))
+        )
         corner = sum(o * b for o, b in zip(self.grid.origin, self.beams.direction, strict=True))
         common = -self.acquisition.phase_per_metre * corner
         return self._render(spectrum * self._window) * complex(math.cos(common), math.sin(common))

@@ -27,11 +27,11 @@ FILTERS = {"fir": FIRFilter, "polynomial": PolynomialFilter, "svd": SVDFilter, "
 class ScannerOptions:
     """The simulated scanner, in SI units and dB; what is common to speckle and Doppler measurements.
 
-    every: measure each K-th frame. snr: blood over thermal noise. tissue: echogenicity over blood, outside the
-    blood. clutter: still echoes over blood, within it; ``None`` = none. frequency, sound_speed, prf, packet: see
-    :class:`Acquisition`. axial_width, lateral_width: FWHM of the point spread. image_spacing: between samples of
-    the image (made to divide the recording's spacing). clutter_filter: fir, polynomial, svd or none.
-    beam: direction of the beams, x, y, z; ``None`` = along the last axis. device: for torch.
+    every: measure each K-th frame. snr: blood over thermal noise. tissue: echogenicity over blood, outside
+    the blood. clutter: still echoes over blood, within it; ``None`` = none. frequency, sound_speed, prf,
+    packet: see :class:`Acquisition`. axial_width, lateral_width: FWHM of the point spread. image_spacing:
+    between samples of the image (made to divide the recording's spacing). clutter_filter: fir, polynomial,
+    svd or none. beam: direction of the beams, x, y, z; ``None`` = along the last axis. device: for torch.
     """
 
     every: int = 1
@@ -55,15 +55,26 @@ class ScannerOptions:
         if not (math.isfinite(self.image_spacing) and self.image_spacing > 0):
             raise ValueError(f"image_spacing must be positive and finite, got {self.image_spacing!r}")
         if self.clutter_filter not in FILTERS:
-            raise ValueError(f"clutter_filter must be one of {', '.join(FILTERS)}, got {self.clutter_filter!r}")
+            raise ValueError(
+                f"clutter_filter must be one of {', '.join(FILTERS)}, got {self.clutter_filter!r}"
+            )
         self.echo_model(3 if self.beam is None else len(self.beam))  # its parts check the rest
         filtering = self.filter()
         if filtering is not None:
-            filtering.apply(torch.zeros((self.packet, 1), dtype=torch.complex64))  # a packet too short says so
+            filtering.apply(
+                torch.zeros((self.packet, 1), dtype=torch.complex64)
+            )  # a packet too short says so
 
     def filter(self) -> ClutterFilter | None:
         kind = FILTERS[self.clutter_filter]
         return None if kind is None else kind()
+
+    def summary(self) -> str:
+        """The settings in words, for the description of a recording."""
+        return (
+            f"{self.frequency / 1e6:g} MHz, PRF {self.prf:g} Hz, packet {self.packet}, SNR {self.snr:g} dB, "
+            f"tissue {self.tissue:g} dB, clutter filter {self.clutter_filter}"
+        )
 
     def echo_model(self, dimension: int) -> EchoModel:
         direction = self.beam or (0.0,) * (dimension - 1) + (1.0,)
@@ -76,17 +87,23 @@ class ScannerOptions:
         )  # fmt: skip
 
     def spacing(self, grid: Grid) -> tuple[float, ...]:
-        """Image spacing, x, y, z: the nearest that divides the recording's, so that its nodes are image nodes."""
+        """Image spacing, x, y, z: the nearest that makes the recording's nodes image nodes."""
         return tuple(step / max(1, round(step / self.image_spacing)) for step in grid.spacing)
 
 
 def scanned(
-    true: Recording, options: ScannerOptions, models: list[EchoModel], seed: int, margin: float, *, progress: bool
+    true: Recording,
+    options: ScannerOptions,
+    models: list[EchoModel],
+    seed: int,
+    margin: float,
+    *,
+    progress: bool,
 ) -> Iterator[tuple[int, Tensor, list[Packet]]]:
     """For each frame to measure: its number, the points (n, D) inside the mask, and a packet of each model.
 
-    All packets of a frame show the same scatterers in the same noise-free motion. ``margin`` (m) of image is kept
-    around the points. Frames without blood give no points and no packets.
+    All packets of a frame show the same scatterers in the same noise-free motion. ``margin`` (m) of image
+    is kept around the points. Frames without blood give no points and no packets.
     """
     flow = RecordingFlow(true, device=options.device)
     nodes = true.grid.nodes()
@@ -135,8 +152,12 @@ class Canvas:
         self.weight[row][mask] = weight.cpu().numpy()
 
     def recording(self, description: str, beam: tuple[float, ...] | None = None) -> Recording:
-        base = self.true.select(self.frames).with_velocity(self.velocity, sigma=self.sigma, description=description)
+        base = self.true.select(self.frames).with_velocity(
+            self.velocity, sigma=self.sigma, description=description
+        )
         if beam is None:
             return replace(base, weight=self.weight)
-        field = np.broadcast_to(np.reshape(beam, (-1, *[1] * len(self.true.grid.shape))), self.velocity.shape[1:])
+        field = np.broadcast_to(
+            np.reshape(beam, (-1, *[1] * len(self.true.grid.shape))), self.velocity.shape[1:]
+        )
         return replace(base, weight=self.weight, beam=field)

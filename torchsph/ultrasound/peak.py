@@ -10,7 +10,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-
 FIT_WEIGHTS = (1.0, 1.0, 0.1, 0.01)  # of nodes 0 to 3 steps off the middle
 
 
@@ -18,9 +17,10 @@ FIT_WEIGHTS = (1.0, 1.0, 0.1, 0.01)  # of nodes 0 to 3 steps off the middle
 class Peak:
     """A correlation peak of each point; lags in nodes, in the order of the array's axes.
 
-    lag (P, A): of the vertex, from the middle of the search. hessian (P, A, A) of |rho|, per node squared. value
-    (P,): complex rho at the vertex, |value| <= 1. ratio (P,): of the highest magnitude to the highest other local
-    maximum, or to the lowest value where there is none. concave (P,): whether the paraboloid has a maximum.
+    lag (P, A): of the vertex, from the middle of the search. hessian (P, A, A) of |rho|, per node squared.
+    value (P,): complex rho at the vertex, |value| <= 1. ratio (P,): of the highest magnitude to the
+    highest other local maximum, or to the lowest value where there is none. concave (P,): whether the
+    paraboloid has a maximum.
     """
 
     lag: Tensor
@@ -32,7 +32,8 @@ class Peak:
     def constrained(self, direction: Tensor, along: Tensor) -> Tensor:
         """Lag (P, A) of the paraboloid's maximum among those with lag . direction = along.
 
-        With an axial lag known better (from the phase), the lateral ones follow it along the paraboloid's ridge.
+        With an axial lag known better (from the phase), the lateral ones follow it along the paraboloid's
+        ridge.
         """
         tilt = torch.linalg.solve(self.hessian, direction[..., None])[..., 0]
         gap = along - (self.lag * direction).sum(-1)
@@ -42,8 +43,8 @@ class Peak:
 def find_peak(rho: Tensor) -> Peak:
     """The peak of |rho|, complex (P, L1, ..., LA) with three or more (odd) lags on every axis.
 
-    At the rim of the search the paraboloid is fitted one node further in and may be followed outwards by up to a
-    node and a half: a peak beyond the rim shows as a lag beyond it.
+    At the rim of the search the paraboloid is fitted one node further in and may be followed outwards by
+    up to a node and a half: a peak beyond the rim shows as a lag beyond it.
     """
     lags = rho.shape[1:]
     flat = rho.abs().flatten(1)
@@ -75,9 +76,9 @@ def _terms(offset: Tensor) -> Tensor:
 def _fit_matrix(axes: int) -> Tensor:
     """(K, 3^A): weighted least-squares coefficients of the quadratic from values on {-1, 0, 1}^A.
 
-    The further from the middle, the less a correlation is a quadratic: nodes off by one step on two or three axes
-    weigh 1/10 and 1/100. They are needed for the mixed derivatives alone; with equal weights their misfit made up
-    most of the lateral error on noise-free uniform motion.
+    The further from the middle, the less a correlation is a quadratic: nodes off by one step on two or
+    three axes weigh 1/10 and 1/100. They are needed for the mixed derivatives alone; with equal weights
+    their misfit made up most of the lateral error on noise-free uniform motion.
     """
     nodes = torch.tensor(list(product((-1.0, 0.0, 1.0), repeat=axes)), dtype=torch.float64)
     steps = (nodes != 0).sum(1)

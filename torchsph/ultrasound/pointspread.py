@@ -39,8 +39,8 @@ class PointSpread(Protocol):
 class GaussianPointSpread:
     """Gaussian envelope, ``axial`` and ``lateral`` full widths at half amplitude (two-way), m.
 
-    The carrier is in the phase of the scatterers (see :class:`Packet`). ``lateral`` holds across the beam in all
-    directions.
+    The carrier is in the phase of the scatterers (see :class:`Packet`). ``lateral`` holds across the beam
+    in all directions.
     """
 
     axial: float = 0.5e-3
@@ -66,7 +66,9 @@ class GaussianPointSpread:
             for b in range(len(direction))
             if abs(float(covariance[a, b])) > 1e-15 * float(covariance.diagonal().max())
         )
-        return math.sqrt((2 * math.pi) ** len(direction) * float(covariance.det())) * torch.exp(-0.5 * exponent)
+        return math.sqrt((2 * math.pi) ** len(direction) * float(covariance.det())) * torch.exp(
+            -0.5 * exponent
+        )
 
     def energy(self, dimension: int) -> float:
         axial, lateral = fwhm_to_deviation(self.axial), fwhm_to_deviation(self.lateral)
@@ -81,10 +83,12 @@ class GaussianPointSpread:
 
 @dataclass(frozen=True, eq=False)
 class SampledPointSpread:
-    """A point-spread function given as an array: ``values`` (*shape) complex baseband samples, ``spacing`` x, y, z.
+    """A point-spread function given as an array: ``values`` (*shape) complex baseband samples, ``spacing``
+    x, y, z.
 
-    The middle node (shape // 2) is the scatterer's position. The array's axes are those of the image; the beam's
-    direction does not turn it. The samples must resolve the function (|h| small at the Nyquist frequency).
+    The middle node (shape // 2) is the scatterer's position. The array's axes are those of the image; the
+    beam's direction does not turn it. The samples must resolve the function (|h| small at the Nyquist
+    frequency).
     """
 
     values: Tensor

@@ -19,8 +19,12 @@ class Box:
     upper: tuple[float, ...]
 
     def __post_init__(self) -> None:
-        if len(self.lower) != len(self.upper) or not all(a < b for a, b in zip(self.lower, self.upper, strict=True)):
-            raise ValueError(f"a box needs lower < upper on every axis, got {self.lower!r} and {self.upper!r}")
+        if len(self.lower) != len(self.upper) or not all(
+            a < b for a, b in zip(self.lower, self.upper, strict=True)
+        ):
+            raise ValueError(
+                f"a box needs lower < upper on every axis, got {self.lower!r} and {self.upper!r}"
+            )
 
     @property
     def sides(self) -> tuple[float, ...]:
@@ -56,7 +60,7 @@ def seed_cloud(
 
 
 def advance(position: Tensor, flow: Flow, time: float, step: float) -> Tensor:
-    """Positions (n, D) after ``step`` seconds (of either sign): the classical fourth-order Runge-Kutta method."""
+    """Positions (n, D) after ``step`` seconds (of either sign), by classical Runge-Kutta."""
     k1 = flow.velocity(position, time)
     k2 = flow.velocity(position + 0.5 * step * k1, time + 0.5 * step)
     k3 = flow.velocity(position + 0.5 * step * k2, time + 0.5 * step)
@@ -69,8 +73,8 @@ def carry(
 ) -> Cloud:
     """The cloud at ``time + step``: moved, without those that left ``box``, and reseeded at the inflow.
 
-    What flows in is what came from outside: uniform random candidates whose path back leaves the box. So a cloud
-    that was uniform stays so, and no scatterer inside is disturbed.
+    What flows in is what came from outside: uniform random candidates whose path back leaves the box. So a
+    cloud that was uniform stays so, and no scatterer inside is disturbed.
     """
     position = advance(cloud.position, flow, time, step)
     inside = box.contains(position)
@@ -88,10 +92,11 @@ def reseed(
     cloud: Cloud, box: Box, flow: Flow, time: float, density: float, generator: torch.Generator,
     *, per_cell: float = 100.0,
 ) -> Cloud:  # fmt: skip
-    """Even out a density that a flow has changed (per m^D): new scatterers in thin cells, fewer in crowded ones.
+    """Even out a density that a flow has changed (per m^D): new scatterers in thin cells, fewer in crowded
+    ones.
 
-    Cells hold ``per_cell`` scatterers on average. Only cells more than four Poisson deviations off are brought
-    back to the mean, so a uniform random cloud is left alone.
+    Cells hold ``per_cell`` scatterers on average. Only cells more than four Poisson deviations off are
+    brought back to the mean, so a uniform random cloud is left alone.
     """
     cells = [max(1, round(side * (density / per_cell) ** (1 / len(box.sides)))) for side in box.sides]
     mean = density * box.volume / math.prod(cells)
@@ -136,7 +141,9 @@ def _cell_number(position: Tensor, box: Box, cells: list[int]) -> Tensor:
     share = (position - position.new_tensor(box.lower)) / position.new_tensor(box.sides)
     number = torch.zeros(len(position), dtype=torch.long, device=position.device)
     for axis in reversed(range(len(cells))):
-        number = number * cells[axis] + (share[:, axis] * cells[axis]).floor().long().clamp(0, cells[axis] - 1)
+        number = number * cells[axis] + (share[:, axis] * cells[axis]).floor().long().clamp(
+            0, cells[axis] - 1
+        )
     return number
 
 

@@ -18,8 +18,8 @@ TRAINING = 0x7EA1  # makes the seed of the calibration's simulations differ from
 
 @dataclass(frozen=True)
 class SpeckleOptions(ScannerOptions):
-    """Options of :func:`measure_speckle`: a scanner, and a tracker with a kernel of ``kernel`` m and the search
-    range ``search`` m/s, calibrated on ``training`` simulations of its own."""
+    """Options of :func:`measure_speckle`: a scanner, and a tracker with a kernel of ``kernel`` m and the
+    search range ``search`` m/s, calibrated on ``training`` simulations of its own."""
 
     kernel: float = 1e-3
     search: float = 1.0
@@ -37,11 +37,15 @@ class SpeckleOptions(ScannerOptions):
         return TrainingPlan(simulations=self.training)
 
 
-def measure_speckle(true: Recording, options: SpeckleOptions, seed: int, *, progress: bool = False) -> Recording:
-    """What a scanner and a speckle tracker report of ``true``: every K-th frame, with ``weight`` and ``sigma``.
+def measure_speckle(
+    true: Recording, options: SpeckleOptions, seed: int, *, progress: bool = False
+) -> Recording:
+    """What a scanner and a speckle tracker report of ``true``: every K-th frame, with ``weight`` and
+    ``sigma``.
 
-    Weight and sigma are fitted on random swirls imaged by the same scanner with other seeds, never on ``true``.
-    Flagged estimates have weight and velocity 0. Raises ValueError where beam and recording differ in dimension.
+    Weight and sigma are fitted on random swirls imaged by the same scanner with other seeds, never on
+    ``true``. Flagged estimates have weight and velocity 0. Raises ValueError where beam and recording
+    differ in dimension.
     """
     model, tracker = options.echo_model(true.dimension), options.tracker()
     spacing = options.spacing(true.grid)
@@ -55,11 +59,12 @@ def measure_speckle(true: Recording, options: SpeckleOptions, seed: int, *, prog
         if packets:
             found = tracker.track(packets[0], points)
             beam = model.beams.directions(points).to(found.velocity)
-            canvas.paint(frame, found.velocity, calibration.sigma(found, beam), calibration.weight(found, beam))
+            canvas.paint(
+                frame, found.velocity, calibration.sigma(found, beam), calibration.weight(found, beam)
+            )
             accepted, total = accepted + int(found.accepted.sum()), total + len(points)
     share = accepted / total if total else 0.0
     return canvas.recording(
-        f"speckle tracking of simulated echoes, {options.frequency / 1e6:g} MHz, PRF {options.prf:g} Hz, packet "
-        f"{options.packet}, SNR {options.snr:g} dB, tissue {options.tissue:g} dB, filter {options.clutter_filter}, "
-        f"kernel {options.kernel * 1e3:g} mm, accepted {share:.3f}, seed {seed}"
+        f"speckle tracking of simulated echoes, {options.summary()}, kernel {options.kernel * 1e3:g} mm, "
+        f"accepted {share:.3f}, seed {seed}"
     )

@@ -1,8 +1,9 @@
 """Blood speckle tracking: velocities from the motion of speckle between the images of a packet.
 
-Normalised cross-correlation of small kernels, pooled over the packet, a parabolic sub-sample peak, and the echo's
-phase for the axial component (table 3.1 of the thesis; Trahey, Allison & von Ramm, IEEE TBME 34, 1987, for the
-method; Loupas, Powers & Gill, IEEE UFFC 42, 1995, for what the phase adds). Nothing here knows how images are made.
+Normalised cross-correlation of small kernels, pooled over the packet, a parabolic sub-sample peak, and the
+echo's phase for the axial component (table 3.1 of the thesis; Trahey, Allison & von Ramm, IEEE TBME 34,
+1987, for the method; Loupas, Powers & Gill, IEEE UFFC 42, 1995, for what the phase adds). Nothing here
+knows how images are made.
 """
 
 from __future__ import annotations
@@ -17,8 +18,8 @@ from torch import Tensor
 
 from .acquisition import Packet
 from .clutter import ClutterFilter, FIRFilter
-from .fields import convolve_axis
 from .correlation import KernelShape, correlate, gather
+from .fields import convolve_axis
 from .peak import Peak, find_peak
 
 
@@ -38,16 +39,17 @@ class Flag(IntFlag):
 class SpeckleTracker:
     """Options of speckle tracking; the defaults are table 3.1 of the thesis.
 
-    kernel: side of the kernel, m, on every axis; it covers the nearest odd number of image nodes (7 at 1/6 mm).
-    min_samples: nodes per axis that a kernel needs; coarse images widen it, a cut at the border flags it.
-    search: greatest speed per component, m/s.
-    lags: images between compared ones; the first is searched, each further one refines where it is more certain.
-    phase: refine the axial component by the phase of the correlation.
-    follow_shear: turn the samples of a kernel back by what axial velocity differences turn them between images
-        (from the mean phase of successive images), so that shear does not make their products cancel.
+    kernel: side of the kernel, m, on every axis; it covers the nearest odd number of image nodes (7 at 1/6
+    mm). min_samples: nodes per axis that a kernel needs; coarse images widen it, a cut at the border flags
+    it. search: greatest speed per component, m/s.
+    lags: images between compared ones; the first is searched, each further one refines where it is more
+    certain. phase: refine the axial component by the phase of the correlation.
+    follow_shear: turn the samples of a kernel back by what axial velocity differences turn them between
+        images (from the mean phase of successive images), so that shear does not make their products cancel.
     clutter: filter over the packet, ``None`` = already filtered.
     min_snr: least power over that of thermal noise after the filter, dB, where the packet states its noise;
-        ``None`` = no gate. min_blood: least share of the unfiltered power that passes the filter, dB, or ``None``.
+        ``None`` = no gate. min_blood: least share of the unfiltered power that passes the filter, dB, or
+        ``None``.
     min_correlation: least correlation. tile: points correlated at a time, which bounds memory.
     """
 
@@ -86,9 +88,9 @@ class Estimates:
     velocity (n, D) m/s. correlation (n,) of the accepted lag, in [0, 1]. peak_ratio (n,): highest peak of the
     search over the second. curvature (n, D): -(second derivative of |rho|) / |rho| per axis, 1/m^2. variance
     (n, D): (m/s)^2 up to a constant, what correlation and curvature say of the precision; calibration makes a
-    ``sigma`` of it. power (n,): share of the unfiltered power that passed the clutter filter, dB. snr (n,): power
-    over thermal noise after the filter, dB (NaN if the noise is unknown). lag (n,): images between those compared.
-    flags (n,): :class:`Flag` bits, 0 = accepted.
+    ``sigma`` of it. power (n,): share of the unfiltered power that passed the clutter filter, dB. snr
+    (n,): power over thermal noise after the filter, dB (NaN if the noise is unknown). lag (n,): images
+    between those compared. flags (n,): :class:`Flag` bits, 0 = accepted.
     """
 
     velocity: Tensor
@@ -108,14 +110,16 @@ class Estimates:
 
 
 def track(packet: Packet, points: Tensor, options: SpeckleTracker) -> Estimates:
-    """Track ``points`` (n, D) through a packet. Raises ValueError where fewer than two images are left to compare."""
+    """Track ``points`` (n, D) through a packet. ValueError where no two images are left to compare."""
     images = _prepare(packet, options)
     shape = KernelShape(images.half, images.search)
     nodes = images.nearest_nodes(points)
     beam = packet.beams.directions(points.to(images.real)).flip(-1)  # array order, as everything inside
     beam = F.pad(beam, (3 - beam.shape[1], 0)).to(images.volume.device)
     tiles = [
-        _track_tile(images, nodes[start : start + options.tile], beam[start : start + options.tile], shape, options)
+        _track_tile(
+            images, nodes[start : start + options.tile], beam[start : start + options.tile], shape, options
+        )
         for start in range(0, len(points), options.tile)
     ]
     if not tiles:
@@ -127,8 +131,9 @@ def track(packet: Packet, points: Tensor, options: SpeckleTracker) -> Estimates:
 class _Images:
     """Filtered images in the layout of :mod:`correlation`, padded so that every block fits.
 
-    volume (Z, Y, X, T); raw_power, power (Z, Y, X): mean squares over the images before and after the filter, and
-    finite (Z, Y, X) whether all are finite, all padded by ``margin``. half, search: nodes per array axis.
+    volume (Z, Y, X, T); raw_power, power (Z, Y, X): mean squares over the images before and after the
+    filter, and finite (Z, Y, X) whether all are finite, all padded by ``margin``. half, search: nodes per
+    array axis.
     """
 
     volume: Tensor
@@ -180,8 +185,8 @@ def _prepare(packet: Packet, options: SpeckleTracker) -> _Images:
     filtered = clean if options.clutter is None else options.clutter.apply(clean)
     if len(filtered) < 1 + options.lags[0]:
         raise ValueError(
-            f"{len(filtered)} images are left of {len(packet.iq)} after the clutter filter, too few for a lag of "
-            f"{options.lags[0]}; use a longer packet or a shorter filter"
+            f"{len(filtered)} of {len(packet.iq)} images are left after the clutter filter, too few for a "
+            f"lag of {options.lags[0]}; use a longer packet or a shorter filter"
         )
     spacing = list(reversed(packet.grid.spacing))
     reach = options.search * packet.acquisition.interval * options.lags[0]
@@ -202,7 +207,8 @@ def _prepare(packet: Packet, options: SpeckleTracker) -> _Images:
         padded(finite.to(volume.real.dtype)), padded(torch.ones_like(clean[0].real)),
         tuple([0] * lead + half), tuple([0] * lead + search), tuple(pad),
         torch.tensor([1.0] * lead + spacing, dtype=volume.real.dtype, device=volume.device),
-        packet, None if packet.noise is None else packet.noise * gain, _turn_gradient(volume, half) if options.follow_shear else None,
+        packet, None if packet.noise is None else packet.noise * gain,
+        _turn_gradient(volume, half) if options.follow_shear else None,
         tuple(range(lead, 3)),
     )  # fmt: skip
 
@@ -210,9 +216,9 @@ def _prepare(packet: Packet, options: SpeckleTracker) -> _Images:
 def _turn_gradient(volume: Tensor, half: list[int]) -> Tensor:
     """Change along each axis, (Z, Y, X, 3) rad per node, of how much echoes turn from one image to the next.
 
-    The turn is the phase of the lag-one autocorrelation (Kasai et al., IEEE Trans. Sonics Ultrason. 32, 1985); its
-    gradient is that of neighbouring nodes against each other, averaged over twice the kernel: with only three
-    numbers per kernel taken from the data, little of the speckle's own phase gets into them.
+    The turn is the phase of the lag-one autocorrelation (Kasai et al., IEEE Trans. Sonics Ultrason. 32,
+    1985); its gradient is that of neighbouring nodes against each other, averaged over twice the kernel:
+    with only three numbers per kernel taken from the data, little of the speckle's own phase gets into them.
     """
     product = (volume[..., :-1].conj() * volume[..., 1:]).sum(-1)
     lead = 3 - len(half)
@@ -269,6 +275,7 @@ def _gates(
     images: _Images, corner: Tensor, shape: KernelShape, options: SpeckleTracker
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Power over noise (dB), share of power passed (dB) and the flags that need no correlation, each (P,)."""
+
     def kernel(field: Tensor) -> Tensor:
         return gather(field[..., None].contiguous(), corner, shape.size)[..., 0].transpose(0, 1)
 
@@ -333,7 +340,13 @@ def _estimate(
     if options.phase:
         k = images.packet.acquisition.phase_per_metre
         expected = (shift * along).sum(1) if prior is None else (prior.motion[:, active] * along).sum(1) * lag
-        axial = -(peak.value.angle() + 2 * math.pi * torch.round((-k * expected - peak.value.angle()) / (2 * math.pi))) / k
+        axial = (
+            -(
+                peak.value.angle()
+                + 2 * math.pi * torch.round((-k * expected - peak.value.angle()) / (2 * math.pi))
+            )
+            / k
+        )
         # a lag in nodes is lag * spacing metres, hence the direction
         lag_nodes = peak.constrained(along * spacing, axial - (start * along).sum(1))
         shift = start + lag_nodes * spacing
@@ -341,19 +354,29 @@ def _estimate(
     count = max(images.volume.shape[-1] - lag, 1)
     whole = offset.new_zeros((len(offset), 3)).to(shift)
     motion, curves, spread = whole.clone(), whole.clone(), whole.clone()
-    motion[:, active], curves[:, active], spread[:, active] = shift / lag, curvature, variance / (lag**2 * count)
+    motion[:, active], curves[:, active], spread[:, active] = (
+        shift / lag,
+        curvature,
+        variance / (lag**2 * count),
+    )
     sound = peak.concave & (magnitude > 0)
     return _State(motion, magnitude, peak.ratio, curves, spread, torch.full_like(offset[:, 0], lag), sound)
 
 
 def _precision(
-    peak: Peak, magnitude: Tensor, spacing: Tensor, along: Tensor, lag: int, options: SpeckleTracker, images: _Images
+    peak: Peak,
+    magnitude: Tensor,
+    spacing: Tensor,
+    along: Tensor,
+    lag: int,
+    options: SpeckleTracker,
+    images: _Images,
 ) -> tuple[Tensor, Tensor]:
     """Variance of the shift per axis, m^2, up to a constant, and relative curvature, 1/m^2, both (P, D).
 
-    The variance of a correlation peak is that of the noise, 1 - rho^2, over its curvature (as in the Cramer-Rao
-    bound of Walker & Trahey, IEEE UFFC 42, 1995); of the axial component, over the square of the carrier if the
-    phase is used.
+    The variance of a correlation peak is that of the noise, 1 - rho^2, over its curvature (as in the
+    Cramer-Rao bound of Walker & Trahey, IEEE UFFC 42, 1995); of the axial component, over the square of
+    the carrier if the phase is used.
     """
     metric = torch.outer(spacing, spacing)
     relative = -peak.hessian / metric / magnitude.clamp_min(1e-6)[:, None, None]

@@ -17,10 +17,11 @@ from .tracking import SpeckleTracker
 
 @dataclass(frozen=True, eq=False)
 class SwirlFlow:
-    """Random divergence-free flow in a ball (a disc in 2-D) of still tissue, at rest in time.
+    """Random divergence-free flow in a ball (a disc in 2-D) of tissue that moves as a whole, steady in time.
 
     A sum of transverse plane waves, each a random ``wave`` vector (m, D), rad/m, with an ``amplitude`` (m, D)
     across it, m/s, and a ``phase`` (m,), on top of a ``mean`` (D,); blood within ``radius`` of ``centre``.
+    ``tissue`` (D,): velocity of the tissue, m/s.
     """
 
     wave: Tensor
@@ -29,43 +30,55 @@ class SwirlFlow:
     mean: Tensor
     centre: Tensor
     radius: float
+    tissue: Tensor
 
     def velocity(self, points: Tensor, time: float) -> Tensor:
         offset = points - self.centre.to(points)
         field = torch.sin(offset @ self.wave.to(points).T + self.phase.to(points)) @ self.amplitude.to(points)
-        # tissue is still, and the last half millimetre of blood slows down to it
-        fade = ((self.radius - offset.norm(dim=1)) / 0.5e-3).clamp(0, 1)
-        return (field + self.mean.to(points)) * fade[:, None]
+        # no slip: the last half millimetre of blood goes over to the velocity of the tissue
+        fade = ((self.radius - offset.norm(dim=1)) / 0.5e-3).clamp(0, 1)[:, None]
+        return (field + self.mean.to(points)) * fade + self.tissue.to(points) * (1 - fade)
 
     def blood(self, points: Tensor, time: float) -> Tensor:
         return (points - self.centre.to(points)).norm(dim=1) < self.radius
 
 
 def random_swirl(
-    centre: tuple[float, ...], radius: float, speed: float, generator: torch.Generator, *, waves: int = 6
-) -> SwirlFlow:
-    """A swirl of RMS ``speed``, m/s, with wavelengths between one and three diameters of the ball."""
+    centre: tuple[float, ...], radius: float, speed: float, generator: torch.Generator,
+    *, waves: int = 6, tissue_speed: float = 0.0,
+) -> SwirlFlow:  # fmt: skip
+    """A swirl of RMS ``speed``, m/s, with wavelengths between one and three diameters of the ball.
+
+    Each component of the tissue's velocity is drawn with a deviation of ``tissue_speed``, m/s.
+    """
     dimension = len(centre)
 
     def normal(*shape: int) -> Tensor:
         return torch.randn(shape, generator=generator, dtype=torch.float64, device=generator.device)
 
     direction = torch.nn.functional.normalize(normal(waves, dimension), dim=1)
-    length = 2 * radius * (1 + 2 * torch.rand(waves, generator=generator, dtype=torch.float64, device=generator.device))
+    length = (
+        2
+        * radius
+        * (1 + 2 * torch.rand(waves, generator=generator, dtype=torch.float64, device=generator.device))
+    )
     amplitude = normal(waves, dimension)
     amplitude = amplitude - (amplitude * direction).sum(1, keepdim=True) * direction
     mean = normal(dimension)
     scale = speed / math.sqrt(0.5 * float(amplitude.square().sum()) + float(mean.square().sum()))
     phase = 2 * math.pi * torch.rand(waves, generator=generator, dtype=torch.float64, device=generator.device)
     wave = direction * (2 * math.pi / length)[:, None]
-    return SwirlFlow(wave, amplitude * scale, phase, mean * scale, mean.new_tensor(centre), radius)
+    tissue = normal(dimension) * tissue_speed
+    return SwirlFlow(wave, amplitude * scale, phase, mean * scale, mean.new_tensor(centre), radius, tissue)
 
 
 @dataclass(frozen=True)
 class TrainingPlan:
-    """simulations: packets. radius: of the blood, m. margin: tissue around it in view, m. step: between points, m.
+    """simulations: packets. radius: of the blood, m. margin: tissue around it in view, m. step: between
+    points, m.
 
     slowest, fastest: RMS speeds, m/s, spread evenly over the simulations on a logarithmic scale.
+    tissue_speed: deviation of each component of the tissue's velocity, m/s.
     """
 
     simulations: int = 8
@@ -74,9 +87,14 @@ class TrainingPlan:
     step: float = 1e-3
     slowest: float = 0.05
     fastest: float = 0.5
+    tissue_speed: float = 0.02
 
     def __post_init__(self) -> None:
-        if isinstance(self.simulations, bool) or not isinstance(self.simulations, int) or self.simulations < 2:
+        if (
+            isinstance(self.simulations, bool)
+            or not isinstance(self.simulations, int)
+            or self.simulations < 2
+        ):
             raise ValueError(f"simulations must be a whole number >= 2, got {self.simulations!r}")
         for name in ("radius", "step", "slowest", "fastest"):
             if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0):
@@ -95,20 +113,22 @@ def calibrate(
     model: EchoModel, tracker: SpeckleTracker, spacing: tuple[float, ...], generator: torch.Generator,
     plan: TrainingPlan = TrainingPlan(),
 ) -> Calibration:  # fmt: skip
-    """Fit deviations and weights of ``tracker`` on random swirls seen by ``model``; image ``spacing`` x, y, z, m."""
+    """Fit deviations and weights of ``tracker`` on random swirls; image ``spacing`` x, y, z, m."""
     centre = (0.0,) * len(spacing)
     reach = plan.radius + plan.margin
     # symmetric about the middle, so that the points to track fall on image nodes whenever step is a multiple
     sides = [math.ceil(reach / s) for s in spacing]
     grid = Grid(
-        tuple(-n * s for n, s in zip(sides, spacing, strict=True)), spacing, tuple(2 * n + 1 for n in reversed(sides))
+        tuple(-n * s for n, s in zip(sides, spacing, strict=True)),
+        spacing,
+        tuple(2 * n + 1 for n in reversed(sides)),
     )
     points = training_points(plan, centre).to(generator.device)
     parts, errors = [], []
     for number in range(plan.simulations):
         share = number / (plan.simulations - 1)
         speed = plan.slowest ** (1 - share) * plan.fastest**share
-        flow = random_swirl(centre, plan.radius, speed, generator)
+        flow = random_swirl(centre, plan.radius, speed, generator, tissue_speed=plan.tissue_speed)
         estimates = tracker.track(simulate_packet(flow, grid, model, 0.0, generator), points)
         parts.append(estimates)
         errors.append(estimates.velocity - flow.velocity(points, 0.0).to(estimates.velocity))
