@@ -48,8 +48,7 @@ class WallMotion:
     def from_recording(cls, recording: Recording) -> WallMotion:
         """The motion of a recording's wall, with `/wall/velocity` where it is given.
 
-        With a period, the first key frame is repeated a period later unless the frames already reach that
-        far.
+        With a period that the frames do not fill, the first key frame is repeated a period later.
         """
         wall, time = recording.wall, recording.time
         if not wall.moves or recording.frames == 1:
@@ -57,15 +56,14 @@ class WallMotion:
         vertices, rates = wall.vertices, wall.velocity
         if rates is not None:
             rates = rates.astype(np.float64)
-        period = recording.period
-        # A frame within a tenth of a step of the period's end is taken as that end.
-        if period and time[-1] < time[0] + period - 0.1 * (time[-1] - time[-2]):
-            time = np.append(time, time[0] + period)
-            vertices = np.concatenate([vertices, vertices[:1]])
-            rates = None if rates is None else np.concatenate([rates, rates[:1]])
-        elif period and time[-1] < time[0] + period:
-            period = float(time[-1] - time[0])
-        return cls.through(time, vertices, wall.faces, wall.region, rates=rates, period=period)
+        end = time[0] + recording.period
+        if recording.period and time[-1] < end:
+            # A last frame just before the end would leave a key interval next to nothing long: drop it.
+            keep = time < end - 0.1 * (time[-1] - time[-2])
+            time = np.append(time[keep], end)
+            vertices = np.concatenate([vertices[keep], vertices[:1]])
+            rates = None if rates is None else np.concatenate([rates[keep], rates[:1]])
+        return cls.through(time, vertices, wall.faces, wall.region, rates=rates, period=recording.period)
 
     @classmethod
     def through(cls, time, vertices, faces, region, *, rates=None, period: float = 0.0) -> WallMotion:
@@ -144,8 +142,10 @@ class WallMotion:
         if not self.moves:
             return 0, 0.0, 0.0
         start, end = float(self.time[0]), float(self.time[-1])
-        if self.period:
-            t = start + (t - start) % self.period
+        if self.period and not start <= t <= end:
+            # Into the nearest period that is covered; of several recorded beats each keeps its own motion.
+            beats = math.ceil((t - end) / self.period) if t > end else -math.ceil((start - t) / self.period)
+            t -= beats * self.period
         # Sums of time steps miss the last frame by round-off.
         slack = 1e-6 * (end - start) / (len(self.time) - 1)
         if not start - slack <= t <= end + slack:
@@ -161,10 +161,10 @@ class WallMotion:
 
 
 def _differences(time: np.ndarray, vertices: np.ndarray, period: float) -> np.ndarray:
-    """Three-point differences in time, second order on uneven steps too, through the end of a period."""
+    """Three-point differences, second order on uneven steps too; around the end where that is a period's."""
     if len(time) < 2:
         return np.zeros_like(vertices)
-    if not period:
+    if abs(time[-1] - time[0] - period) > 1e-9 * (time[-1] - time[0]):
         return np.gradient(vertices, time, axis=0, edge_order=min(len(time) - 1, 2))
     time = np.concatenate([[time[-2] - period], time, [time[1] + period]])
     vertices = np.concatenate([vertices[-2:-1], vertices, vertices[1:2]])

@@ -117,6 +117,23 @@ def test_a_recordings_period_is_closed(box_recording: Callable, times: tuple, ke
         assert motion.volume(0.29) == pytest.approx(1e-6) and motion.volume(3.29) == pytest.approx(1e-6)
 
 
+def test_of_several_recorded_beats_each_keeps_its_own_motion(box_recording: Callable) -> None:
+    recording = _recording(box_recording, (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6), 0.3)
+    grown = recording.wall.vertices * (1 + recording.time[:, None, None])
+    motion = WallMotion.through(
+        recording.time, grown, recording.wall.faces, recording.wall.region, period=0.3
+    )
+    for t, same in ((0.15, 0.15), (0.45, 0.45), (0.75, 0.45), (-0.2, 0.1), (1.05, 0.45)):
+        np.testing.assert_allclose(motion.vertices(t), motion.vertices(same), atol=1e-15)
+    assert motion.volume(0.45) > 1.5 * motion.volume(0.15)
+    assert motion.velocity(0.6).max() == pytest.approx(0.01, rel=1e-9)
+
+
+def test_a_last_frame_just_before_the_period_ends_is_replaced(box_recording: Callable) -> None:
+    motion = WallMotion.from_recording(_recording(box_recording, (0.0, 0.1, 0.2, 0.2999), 0.3))
+    np.testing.assert_allclose(motion.time, [0.0, 0.1, 0.2, 0.3])
+
+
 def test_a_recording_without_wall_velocity_is_differenced(box_recording: Callable) -> None:
     drift = np.array([0.1, 0.0, -0.2])
     recording = box_recording(lambda p, t: 0 * p, wall_velocity=lambda p: drift + 0 * p)
