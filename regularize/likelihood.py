@@ -96,7 +96,7 @@ class LikelihoodSearch:
         fit = VectorRows(knots, groups.points, groups.velocity, groups.weight[:, None])
         every = [fit, *groups.fixed] + ([] if groups.slip is None else [groups.slip])
         self.ordering = order(System(knots, self.components, every, 0.0))
-        self.fit = fit
+        self.fit, self.step = fit, max(knots.spacing[: self.components])  # m, time left out
         self.curvature = _Alike(groups.curvature, self.ordering)
         self.slip = None if groups.slip is None else _Alike(groups.slip, self.ordering)
         silent = VectorRows(knots, groups.points, groups.velocity, torch.zeros_like(groups.weight)[:, None])
@@ -137,8 +137,7 @@ class LikelihoodSearch:
         x = posterior.solve(right + fit * self.data.right)
         known, all_known = prior.solve(self.probes), posterior.solve(self.probes)
         new_fit, gained = self._noise(x, fit, all_known), known - all_known
-        step = max(self.fit.knots.spacing)
-        low, high = (self._scale(fit) * (factor * step) ** 4 for factor in (SHARPEST, 1 / SHARPEST))
+        low, high = (self._scale(fit) * (factor * self.step) ** 4 for factor in (SHARPEST, 1 / SHARPEST))
         rough *= self._step(gained, self.curvature_probes, self.curvature.energy(x))
         rough = min(max(rough, low), high)
         if slip > 0:
@@ -190,7 +189,7 @@ class LikelihoodSearch:
         weight = self.groups.weight * factor.sqrt()
         rows = VectorRows(self.fit.knots, self.groups.points, self.groups.velocity, weight[:, None])
         self.data = _Alike(rows, self.ordering)
-        ridge = (RIDGE * max(self.fit.knots.spacing)) ** 4 * float(weight.double().square().sum())
+        ridge = (RIDGE * self.step) ** 4 * float(weight.double().square().sum())
         factor = Factor(self.data.band + ridge * self.curvature.band, self.ordering)
         self.unpenalised = factor.solve(self.data.right[:, None]).squeeze(1)
         probe = self.probes[:, :1]

@@ -90,6 +90,19 @@ class VectorRows(_PointRows):
         other.target = (self.target.view(other.weight.shape) * factor).flatten()
         return other
 
+    def detached(self) -> "VectorRows":
+        """The same rows without their autograd graph."""
+        other = object.__new__(VectorRows)
+        other.__dict__.update(self.__dict__)
+        other.weight, other.target = self.weight.detach(), self.target.detach()
+        return other
+
+    def with_unit_weight(self) -> "VectorRows":
+        """The same points with weight 1 (and no meaningful target)."""
+        other = self.detached()
+        other.weight = torch.ones_like(other.weight)
+        return other
+
     def component(self, k: int) -> "VectorRows":
         """The rows of one component, as rows of a scalar field."""
         one = object.__new__(VectorRows)

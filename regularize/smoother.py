@@ -21,6 +21,7 @@ from .bspline import DEGREES
 from .direct import Factor, PreparedSystem, solve_direct
 from .errors import InvalidInput
 from .field import SplineField
+from .implicit import solve_with_gradient
 from .krylov import Solution, lsqr
 from .lsmr import lsmr
 from .operators import System
@@ -156,13 +157,18 @@ class Smoother:
         ``box``: lower and upper corner of the knot grid (default: around all points); give the same one for
         all frames of a recording. ``uncertainty``: keep the factor for ``field.std``. ``neighbour``: with
         solver="pcg", an earlier such fit on the same knots, whose factor and coefficients start this one (the
-        first frame, and one too unlike its neighbour, are solved directly). Samples of zero weight are
-        ignored and may be NaN. Raises InvalidInput for bad input, NotConverged when the solver fails.
+        first frame, and one too unlike its neighbour, are solved directly). Velocities and weights that
+        require gradients pass them on to the field (options fixed, solver "auto" or "direct"). Samples of
+        zero weight are ignored and may be NaN. Raises InvalidInput for bad input, NotConverged when the
+        solver fails.
         """
         where = (divergence_points, box, self.power)
         data = FitData.checked(points, velocity, weight, wall, *where, beam=beam)
         if beam is not None and self.automatic:
             raise InvalidInput("automatic choice needs full vectors: use fixed(...) for samples along a beam")
+        traced = data.velocity.requires_grad or data.weight.requires_grad
+        if traced and (self.automatic or beam is not None or self.solver not in ("auto", "direct")):
+            raise InvalidInput("gradients need fixed(...) options, full vectors and the direct solver")
         problem = self._problem(data)
         if self.solver == "pcg" and neighbour is not None:
             solution, factor = self._with_neighbour(problem.system, neighbour)
@@ -171,7 +177,8 @@ class Smoother:
             if uncertainty:
                 raise InvalidInput(f"solver {self.solver!r} keeps no factor for uncertainty: use 'direct'")
             return problem.field(self._iterate(problem.system))
-        solution, factor = solve_direct(problem.system, tolerance=self.tolerance)
+        solve = solve_with_gradient if traced else solve_direct
+        solution, factor = solve(problem.system, tolerance=self.tolerance)
         return problem.field(solution, factor if uncertainty or self.solver == "pcg" else None)
 
     def fit_many(

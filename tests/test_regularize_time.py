@@ -30,7 +30,8 @@ def test_polynomials_in_space_and_time_are_reproduced(axes):
     options = OPTIONS.fixed(knots=6e-3, time_knots=0.05, curvature=1e-6, time_curvature=1e-4)
     field = options.fit(points, swirl(points))
     test = spacetime(100, axes, seed=1)
-    assert field.knots.axes == axes + 1 and field.components == axes
+    test = test[field.supported(test)]
+    assert len(test) > 90 and field.knots.axes == axes + 1 and field.components == axes
     assert torch.allclose(field(test), swirl(test), atol=1e-3)
     assert float(field.divergence(test).abs().max()) < 0.05  # against gradients of 100 1/s
     step = torch.zeros(axes + 1, dtype=torch.float64)
