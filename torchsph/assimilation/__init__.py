@@ -30,6 +30,7 @@ from .diagnostics import (
 )
 from .distributed import Distributed, gather_members, member_slice
 from .enkf import StochasticEnKF
+from .error_scale import ErrorScale
 from .errors import AssimilationError
 from .etkf import ETKF
 from .failures import Repaired, Replacement, replace_failed
@@ -59,6 +60,7 @@ __all__ = [
     "Augmentation",
     "Distributed",
     "EnsembleFilter",
+    "ErrorScale",
     "ErrorSubspace",
     "Filter",
     "FilterRecord",

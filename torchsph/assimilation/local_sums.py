@@ -65,7 +65,7 @@ class LocalSums:
         _add(products, column, which, weighted * screened.innovation.unsqueeze(-1))
         _add(products, column + rank, which, screened.weight.unsqueeze(-1))
         reached = torch.zeros(len(seen), dtype=torch.bool, device=modes.device)
-        return cls(seen, which, products, rank, localisation, reached)
+        return cls(seen.to(dtype), which, products, rank, localisation, reached)
 
     @property
     def useful(self) -> Tensor:
@@ -80,7 +80,7 @@ class LocalSums:
 
     def at(self, places: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Gram `(*batch, P, r, r)`, right side `(*batch, P, r)`, weight `(*batch, P)`; float64."""
-        taper = self.localisation.taper(places, self.seen)
+        taper = self.localisation.taper(places.to(self.seen.dtype), self.seen)
         near = (taper > 0).any(0)
         self._reached.logical_or_(near)
         taper, products = taper.to(self.products.dtype), self.products
