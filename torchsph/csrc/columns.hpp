@@ -16,8 +16,8 @@
 
 namespace sph {
 
-constexpr double column_width = 0.8;         // in search radii, across the columns
-constexpr double bin_width = 0.2;            // in search radii, along them
+constexpr double column_width = 1.0;            // in search radii, across the columns
+constexpr double bin_width = 0.15;              // in search radii, along them
 constexpr std::int64_t bins_per_particle = 32;  // a larger table is made coarser
 constexpr int slack = 16;                    // reals that vector loads may read past the end
 

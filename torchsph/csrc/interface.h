@@ -68,7 +68,7 @@ int sph_pass_f64(const sph_pass*);
 int64_t sph_interpolate_f32(const sph_interpolation*); /* number of unusable particles and queries; 0: done */
 int64_t sph_interpolate_f64(const sph_interpolation*);
 int sph_runs(const char* instruction_set);             /* whether this processor has it */
-double sph_fma_peak(int threads, int64_t turns);       /* float32 multiply-adds, in flop/s */
+double sph_fma(int threads, int64_t turns, float factor); /* float32 multiply-adds; the flop done */
 #pragma GCC visibility pop
 #ifdef __cplusplus
 }

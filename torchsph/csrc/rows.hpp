@@ -91,6 +91,17 @@ SPH_INLINE void particle_fields(const Layout& l, const State<Real>& s, const Lis
   else out[l.factor()] = s.weight == by_volume ? 1 / density : Real(1);
 }
 
+constexpr int ahead = 24;  // slots; the caller's order may be far from that of the clusters
+
+template <class Real, int D> SPH_INLINE void prefetch(const Layout& l, const State<Real>& s, std::int64_t slot) {
+  const std::int64_t i = slot < 0 ? ~slot : slot;
+  __builtin_prefetch(s.position + i * D);
+  if (l.velocity >= 0) __builtin_prefetch(s.velocity + i * D);
+  __builtin_prefetch(s.mass + i);
+  __builtin_prefetch(s.deviation + i);
+  if (l.stress >= 0) __builtin_prefetch(s.pressure + i);
+}
+
 template <class Real, int D> void pack(const Layout& l, const State<Real>& s, const Lists<Real>& lists, Rows<Real>& rows) {
   const int stride = l.stride();
   const std::int64_t slots = lists.clusters * cluster_size;
@@ -101,6 +112,7 @@ template <class Real, int D> void pack(const Layout& l, const State<Real>& s, co
     Real* block = rows.block.data() + g * l.block();
     for (int lane = 0; lane < cluster_size; ++lane) {
       const std::int64_t at = g * cluster_size + lane, i = lists.slot[at];
+      if (at + ahead < slots) prefetch<Real, D>(l, s, lists.slot[at + ahead]);
       Real field[24] = {};
       particle_fields<Real, D>(l, s, lists, at, i < 0 ? ~i : i, field);
       std::memcpy(rows.row.data() + at * stride, field, stride * sizeof(Real));

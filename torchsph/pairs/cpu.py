@@ -40,11 +40,13 @@ class ClusterPairs:
         lists: slot, owner, entries, offset, home of ``cpu_operators.cluster_lists``.
         period: (D,) floats, inf where an axis is not periodic.
         count: number of particles of the search.
+        used: how much of the entries the lists fill.
     """
 
     lists: list[Tensor]
     period: list[float]
     count: int
+    used: int
 
     @property
     def order(self) -> Tensor:
@@ -55,7 +57,9 @@ class ClusterPairs:
     @property
     def bytes(self) -> int:
         """Memory of the lists."""
-        return sum(tensor.numel() * tensor.element_size() for tensor in self.lists)
+        entries = self.lists[2]
+        spare = (entries.numel() - self.used) * entries.element_size()
+        return sum(tensor.numel() * tensor.element_size() for tensor in self.lists) - spare
 
 
 class CpuBackend(Backend):
@@ -87,11 +91,12 @@ class CpuBackend(Backend):
             slot, owner, offset, home, needed = operators.cluster_lists(
                 position.detach().contiguous(), member.contiguous(), radius + margin, length, entries
             )
-            if int(needed) <= entries.numel():
+            used = int(needed)
+            if used <= entries.numel():
                 break
-            entries = self._room(int(1.1 * int(needed)))
-        self.entries_per_particle = int(needed) / max(position.shape[0], 1)
-        pairs = ClusterPairs([slot, owner, entries, offset, home], length, position.shape[0])
+            entries = self._room(int(1.1 * used))
+        self.entries_per_particle = used / max(position.shape[0], 1)
+        pairs = ClusterPairs([slot, owner, entries, offset, home], length, position.shape[0], used)
         weakref.finalize(pairs, _SPARE.append, entries).atexit = False
         return pairs
 

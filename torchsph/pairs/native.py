@@ -179,5 +179,5 @@ def _declare(handle: ctypes.CDLL) -> ctypes.CDLL:
         getattr(handle, f"sph_pass_{reals}").argtypes = [ctypes.POINTER(PassArguments)]
         interpolate = getattr(handle, f"sph_interpolate_{reals}")
         interpolate.argtypes, interpolate.restype = [ctypes.POINTER(InterpolationArguments)], _long
-    handle.sph_fma_peak.argtypes, handle.sph_fma_peak.restype = [_int, _long], _real
+    handle.sph_fma.argtypes, handle.sph_fma.restype = [_int, _long, ctypes.c_float], _real
     return handle
