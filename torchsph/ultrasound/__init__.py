@@ -1,0 +1,69 @@
+"""Ultrasound: from flow to echoes and back to velocities, and a noise model of the whole for sweeps.
+
+Simulation (flow, scatterers, image, echoes) and estimation (clutter, tracking, doppler) meet in IQ packets
+alone: no estimator imports the simulator. Measurements join the two on a recording.
+"""
+
+from .acquisition import Acquisition, Beams, Packet
+from .calibration import Calibration, fit_calibration
+from .clutter import ClutterFilter, FIRFilter, PolynomialFilter, SVDFilter
+from .doppler import (
+    ColourDoppler,
+    DopplerEstimates,
+    DopplerOptions,
+    colour_doppler,
+    measure_doppler,
+    vector_doppler,
+)
+from .echoes import EchoModel, simulate_packet
+from .flow import Flow, LinearFlow, RecordingFlow
+from .noise import NoiseModel, measure_noise
+from .plugin import LibraryTracker, Tracker
+from .pointspread import GaussianPointSpread, PointSpread, SampledPointSpread
+from .speckle import SpeckleOptions, measure_speckle
+from .tracking import Estimates, Flag, SpeckleTracker, track
+from .training import SwirlFlow, TrainingPlan, calibrate, random_swirl
+from .uff import UffVolumes, read_uff, write_uff
+
+__all__ = [
+    "Acquisition",
+    "Beams",
+    "Calibration",
+    "ClutterFilter",
+    "ColourDoppler",
+    "DopplerEstimates",
+    "DopplerOptions",
+    "EchoModel",
+    "Estimates",
+    "FIRFilter",
+    "Flag",
+    "Flow",
+    "GaussianPointSpread",
+    "LibraryTracker",
+    "LinearFlow",
+    "NoiseModel",
+    "Packet",
+    "PointSpread",
+    "PolynomialFilter",
+    "RecordingFlow",
+    "SVDFilter",
+    "SampledPointSpread",
+    "SpeckleOptions",
+    "SpeckleTracker",
+    "SwirlFlow",
+    "Tracker",
+    "TrainingPlan",
+    "UffVolumes",
+    "calibrate",
+    "colour_doppler",
+    "fit_calibration",
+    "measure_doppler",
+    "measure_noise",
+    "measure_speckle",
+    "random_swirl",
+    "read_uff",
+    "simulate_packet",
+    "track",
+    "vector_doppler",
+    "write_uff",
+]
