@@ -22,12 +22,14 @@ from .direct import Factor, PreparedSystem, solve_direct
 from .errors import InvalidInput
 from .field import SplineField
 from .implicit import solve_with_gradient
+from .knots import Knots
 from .krylov import Solution, lsqr
+from .likelihood import Choice
 from .lsmr import lsmr
 from .operators import System
 from .pcg import pcg
 from .problem import Problem
-from .robust import CUTOFFS
+from .robust import CUTOFFS, robust_weight
 from .rows import build_system, knots_for
 from .samples import FitData
 from .search import choose
@@ -67,7 +69,7 @@ class Smoother:
     no_slip: float | None = 0.5
     curvature: float | None = 1e-3
     time_curvature: float | None = 10e-3
-    damping: float | None = 1e-3
+    damping: float | None = 1e-5
     power: float = 1.0
     automatic: str | None = "likelihood"
     robust: str | None = "tukey"
@@ -147,6 +149,7 @@ class Smoother:
         beam: torch.Tensor | None = None,
         uncertainty: bool = False,
         neighbour: SplineField | None = None,
+        choice: Choice | None = None,
     ) -> SplineField:
         """Fit samples velocity (n, D) in m/s at points (n, D) in m with confidences weight (n,) in [0, 1].
 
@@ -169,7 +172,7 @@ class Smoother:
         traced = data.velocity.requires_grad or data.weight.requires_grad
         if traced and (self.automatic or beam is not None or self.solver not in ("auto", "direct")):
             raise InvalidInput("gradients need fixed(...) options, full vectors and the direct solver")
-        problem = self._problem(data)
+        problem = self._problem(data) if choice is None else self._following(data, choice)
         if self.solver == "pcg" and neighbour is not None:
             solution, factor = self._with_neighbour(problem.system, neighbour)
             return problem.field(solution, factor, own_factor=False)
@@ -206,15 +209,29 @@ class Smoother:
 
     def _problem(self, data: FitData) -> Problem:
         knots = knots_for(data, self)
-        options, choice = self, None
-        if self.automatic == "likelihood":
-            choice = choose(self, knots, data)
-            options = self.fixed()
+        choice = choose(self, knots, data) if self.automatic == "likelihood" else None
         if choice is not None:
-            stretch = choice.curvature / self.curvature
-            in_time = None if self.time_curvature is None else stretch * self.time_curvature
-            options = self.fixed(curvature=choice.curvature, time_curvature=in_time, no_slip=choice.no_slip)
-            data = data.reweighed(choice)
+            return self._with_choice(knots, data, choice)
+        return Problem(data, build_system(self.fixed(), knots, data), None)
+
+    def _following(self, data: FitData, choice: Choice) -> Problem:
+        """The problem with another frame's noise, curvature and slip, and this frame's own outliers."""
+        choice = replace(choice, robust=torch.ones_like(data.weight))
+        problem = self._with_choice(knots_for(data, self), data, choice)
+        if self.robust is None:
+            return problem
+        solution, _ = solve_direct(problem.system, tolerance=max(self.tolerance, 1e-4))
+        fit = problem.system.blocks[0]
+        predicted = problem.field(solution)(data.points, outside=0.0).to(fit.target)
+        weight = robust_weight(data.velocity.to(predicted) - predicted, self.robust, data.weight > 0)
+        choice = replace(choice, robust=weight.to(data.weight))
+        return self._with_choice(problem.system.knots, data, choice)
+
+    def _with_choice(self, knots: Knots, data: FitData, choice: Choice) -> Problem:
+        stretch = choice.curvature / self.curvature
+        in_time = None if self.time_curvature is None else stretch * self.time_curvature
+        options = self.fixed(curvature=choice.curvature, time_curvature=in_time, no_slip=choice.no_slip)
+        data = data.reweighed(choice)
         return Problem(data, build_system(options, knots, data), choice)
 
     def _iterate(self, system: System) -> Solution:

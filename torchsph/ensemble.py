@@ -17,7 +17,7 @@ from .forecast import GridForecast, Transfer
 from .observation_error import ObservationError, estimate_error
 from .perturbations import flow_perturbations
 from .simulator import Simulator
-from .smooth import node_weights, smooth, smooth_frame
+from .smooth import FrameSmoother, node_weights, smooth_frames
 
 
 @dataclass(frozen=True)
@@ -31,6 +31,7 @@ class EnsembleOptions:
         localisation: radius at which observations lose all influence, share of the walls' longest extent.
         relaxation: RTPS factor. gross_error: rejection limit in expected standard deviations, or None.
         spline_share: weight of the spline-space analysis in the hybrid gain; 0 leaves the LETKF alone.
+        choose_every: frames after which the smoothness of the innovations is chosen anew.
         memory: frames over which the observation error is averaged that the innovations show.
         transfer: how grid forecasts are put together.
     """
@@ -42,6 +43,7 @@ class EnsembleOptions:
     relaxation: float = 0.5
     gross_error: float | None = 4.0
     spline_share: float = 0.5
+    choose_every: int = 4
     memory: float = 5.0
     transfer: Transfer = Transfer(detail="static")
 
@@ -73,7 +75,7 @@ def default_filter(measured: geometry.Recording, options: EnsembleOptions) -> LE
 
 def assimilate(
     measured: geometry.Recording, model: Simulator, *, members: int = 16, filter: Filter | None = None,
-    options: EnsembleOptions | None = None, smoother: regularize.Smoother | None = None,
+    options: EnsembleOptions | None = None, splines: FrameSmoother | None = None,
     smoothed: geometry.Recording | None = None, seed: int = 0, progress: bool = False,
 ) -> EnsembleRun:
     """Assimilate a measurement into an ensemble of SPH simulations.
@@ -86,7 +88,7 @@ def assimilate(
     Args:
         measured: the recording. model: simulator of its scene. members: at least 2.
         filter: any ``torchsph.assimilation`` filter; None takes ``default_filter``.
-        smoother: of the first field and the spline-space analysis. smoothed: its result, where it is there already.
+        splines: of the first field and the spline-space analysis. smoothed: their result, where it is there already.
         seed: of everything random.
 
     Raises:
@@ -95,10 +97,10 @@ def assimilate(
     if members < 2:
         raise ValueError(f"an ensemble needs at least 2 members, got {members}")
     options = EnsembleOptions() if options is None else options
-    smoother = regularize.Smoother() if smoother is None else smoother
-    smoothed = smooth(measured, smoother, progress=progress) if smoothed is None else smoothed
-    cycle = _Cycle(measured, model, members, filter or default_filter(measured, options), options, smoother,
-                   estimate_error(measured, smoothed), torch.Generator().manual_seed(seed))
+    splines = FrameSmoother(measured, regularize.Smoother()) if splines is None else splines
+    smoothed = smooth_frames(splines, progress) if smoothed is None else smoothed
+    cycle = _Cycle(model, members, filter or default_filter(measured, options), options, splines,
+                   estimate_error(measured, smoothed, splines.choice), torch.Generator().manual_seed(seed))
     cycle.begin(smoothed.velocity[0])
     frames = tqdm(range(1, measured.frames), desc="ensemble", unit="frame", disable=None if progress else True)
     for frame in frames:
@@ -110,13 +112,15 @@ class _Cycle:
     """State of the filter on its way through the frames."""
 
     def __init__(
-        self, measured: geometry.Recording, model: Simulator, members: int, filter_: Filter,
-        options: EnsembleOptions, smoother: regularize.Smoother, error: ObservationError, generator: torch.Generator,
+        self, model: Simulator, members: int, filter_: Filter, options: EnsembleOptions, splines: FrameSmoother,
+        error: ObservationError, generator: torch.Generator,
     ) -> None:
+        measured = splines.recording
         self.measured, self.model, self.members, self.filter = measured, model, members, filter_
-        self.options, self.smoother, self.error, self.generator = options, smoother, error, generator
+        self.options, self.error, self.generator = options, error, generator
+        # innovations have a smoothness of their own, chosen from them as the cycle goes
+        self.increments = FrameSmoother(measured, splines.smoother)
         self.grid = measured.grid
-        self.motion = geometry.WallMotion.from_recording(measured)
         self.nodes = self.grid.nodes()
         self.length = options.length * float(np.mean(self.grid.spacing))
         self.scale = np.ones(measured.dimension)
@@ -228,10 +232,12 @@ class _Cycle:
             if not (weight > 0).any():
                 return mean
             shape = self.grid.shape
-            change = smooth_frame(
-                self.measured, self.motion, frame, self.smoother, innovation.reshape(parts, *shape),
-                weight.reshape(shape), at_rest=True,
+            fitted = self.increments.fit(
+                frame, innovation.reshape(parts, *shape), weight.reshape(shape), at_rest=True,
+                anew=frame % self.options.choose_every == 1 or self.options.choose_every == 1,
             )
+            self.increments.choice = fitted.choice
+            change = self.increments.on_grid(fitted, frame)
             return mean + torch.from_numpy(change).reshape(parts, -1)[:, inside].flatten().to(mean.dtype)
 
         return analyse

@@ -11,12 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 
 import geometry
+import regularize
 
 from .smooth import node_weights
 
-# the spline's fit takes up part of the noise; its residual is that much too small in variance for errors correlated
-# over a knot distance (measured on synthetic correlated noise in test_observation_error)
-_ABSORBED = 1.3
 _LAGS = 6
 _MAD_TO_STD = 1.4826
 
@@ -49,25 +47,34 @@ class ObservationError:
         return self.deviation.reshape(shape) ** 2 * factor
 
 
-def estimate_error(measured: geometry.Recording, smoothed: geometry.Recording) -> ObservationError:
+def estimate_error(
+    measured: geometry.Recording, smoothed: geometry.Recording, choice: regularize.Choice | None = None
+) -> ObservationError:
     """The error model of a measurement from what its smoothed version leaves over.
 
-    The deviation of each component is a robust one (median absolute residual), so that outliers do not widen it; the
-    redundancy is the product over the axes of the integral scales  1 + 2 sum_k rho_k  of the residual.
+    The deviation of each component is a robust one (median absolute residual), so that outliers do not widen it. The
+    redundancy makes the deviation the white-equivalent one that the spline's likelihood chose (``choice.noise``: what
+    independent errors would have to be to disturb the scales of the flow as much); without a choice it is the product
+    over the axes of the residual's integral scales, 1 + 2 sum_k rho_k.
     """
     residual = np.nan_to_num(measured.velocity - smoothed.velocity)
     used = np.stack([node_weights(measured, f) > 0 for f in range(measured.frames)])
     if not used.any():
         raise ValueError("the measurement has no node with a positive weight: nothing is known about the flow")
-    redundancy = 1.0
-    for axis in range(measured.dimension):
-        redundancy *= _integral_scale(residual, used, residual.ndim - 1 - axis)
     if measured.sigma is not None:
-        return ObservationError(None, redundancy)
-    parts = [np.median(np.abs(residual[:, c][used])) for c in range(measured.dimension)]
-    deviation = _MAD_TO_STD * np.sqrt(_ABSORBED) * np.array(parts)
-    floor = 1e-3 * float(np.sqrt(np.mean(measured.velocity[:, 0][used] ** 2)) + 1e-9)
-    return ObservationError(np.maximum(deviation, floor), redundancy)
+        sigma = np.moveaxis(measured.sigma, 1, -1)[used].astype(np.float64)
+        deviation = np.sqrt(np.mean(sigma**2, axis=0))
+    else:
+        parts = [np.median(np.abs(residual[:, c][used])) for c in range(measured.dimension)]
+        floor = 1e-3 * float(np.sqrt(np.mean(np.nan_to_num(measured.velocity[:, 0])[used] ** 2)) + 1e-9)
+        deviation = np.maximum(_MAD_TO_STD * np.array(parts), floor)
+    if choice is not None:
+        redundancy = float(np.mean((np.array(choice.noise) / deviation) ** 2))
+    else:
+        redundancy = float(
+            np.prod([_integral_scale(residual, used, residual.ndim - 1 - k) for k in range(measured.dimension)])
+        )
+    return ObservationError(None if measured.sigma is not None else deviation, max(redundancy, 1.0))
 
 
 def _integral_scale(residual: np.ndarray, used: np.ndarray, axis: int) -> float:

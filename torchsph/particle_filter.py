@@ -1,4 +1,4 @@
-"""The thesis's filter: one simulator runs along, every measured frame is imposed on its particles, the grid is fetched."""
+"""The thesis's filter: one simulator runs along, each measured frame is imposed on it, the grid is fetched."""
 
 from __future__ import annotations
 

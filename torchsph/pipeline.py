@@ -17,7 +17,7 @@ from .particle_filter import filter_sph
 from .scene import Scene
 from .schemes import preset as scheme_preset
 from .simulator import Simulator
-from .smooth import smooth
+from .smooth import FrameSmoother, smooth_frames
 
 METHODS = ("spline", "sph", "ensemble")
 # written to analysis.h5 and run when no method is named
@@ -61,7 +61,8 @@ def run_methods(
     smoother = regularize.Smoother.preset(preset)
     results: dict[str, MethodResult] = {}
     began = clock.perf_counter()
-    smoothed = smooth(measured, smoother, progress=progress)
+    splines = FrameSmoother(measured, smoother)
+    smoothed = smooth_frames(splines, progress)
     if "spline" in methods:
         results["spline"] = MethodResult(smoothed, clock.perf_counter() - began, {"smoother": repr(smoother)})
         began = clock.perf_counter()
@@ -69,13 +70,13 @@ def run_methods(
         spacing = ANALYSIS_SPACING * min(measured.grid.spacing)
     model = make_model(measured, preset=preset, spacing=spacing, device=device)
     if "sph" in methods:
-        run = filter_sph(measured, model, error=estimate_error(measured, smoothed), seed=seed, progress=progress)
+        run = filter_sph(measured, model, error=estimate_error(measured, smoothed, splines.choice), seed=seed, progress=progress)
         results["sph"] = MethodResult(run.recording, clock.perf_counter() - began, run.info)
         began = clock.perf_counter()
     if "ensemble" in methods:
         count = DEFAULT_MEMBERS if members is None else members
         many = assimilate(
-            measured, model, members=count, smoother=smoother, smoothed=smoothed, seed=seed, progress=progress
+            measured, model, members=count, splines=splines, smoothed=smoothed, seed=seed, progress=progress
         )
         results["ensemble"] = MethodResult(many.recording, clock.perf_counter() - began, many.info)
     return results
