@@ -13,6 +13,8 @@ from .krylov import Solution
 from .operators import System
 from .ordering import Ordering, order
 
+SHIFT = 1e-13  # of the largest diagonal entry; a few hundred times the rounding of float64
+
 
 class PreparedSystem:
     """A system in solve order with its normal matrix and gradient, compiled or in torch.
@@ -43,8 +45,19 @@ class PreparedSystem:
         return reference_band(self.system, self.ordering) if self._packed is None else self._packed.band()
 
     def factor(self) -> "Factor":
-        """Cholesky factor of the normal matrix; InvalidInput where it is not positive definite."""
-        return Factor(self.band(), self.ordering)
+        """Cholesky factor of the normal matrix; InvalidInput where it is not positive definite.
+
+        Penalties many orders stronger than the damping can lose it to round-off: then the diagonal is raised
+        by SHIFT of its largest entry, which the refinement on the rows has to make good for.
+        """
+        try:
+            return Factor(self.band(), self.ordering)
+        except InvalidInput:
+            if self.system.damping == 0:
+                raise
+            band = self.band()
+            band[:, 0] += SHIFT * band[:, 0].max()
+            return Factor(band, self.ordering)
 
     def gradient(self, x: torch.Tensor | None = None) -> torch.Tensor:
         """A'(b - A x) - damping^2 x, or A'b."""

@@ -25,6 +25,7 @@ from .robust import inflation, robust_weight
 
 PROBES = 16  # Rademacher vectors per trace: its error is about sqrt(2 / (PROBES unknowns)), under 1 %
 RELAXATION = 1.6  # the plain update converges from one side at a rate near 0.6
+UNLIKE = 10.0  # no component is taken for more than this many times noisier than another
 MOST_PER_ROUND = 1e3  # growth of a precision, where a penalty's energy vanishes
 SETTLED = 0.03  # a round that changes no precision by more than this fraction ends the search
 FLOOR = 1e-3  # slip precisions below this share of the data's no longer matter
@@ -166,7 +167,8 @@ class LikelihoodSearch:
         precision = (self.rank - fit * freed).clamp(min=1.0) / misfit.clamp(min=1e-300)
         if self.robust is not None:
             precision = precision / inflation(self.robust, self.components) ** 2
-        return precision.clamp(max=self.sharpest)
+        precision = precision.clamp(max=self.sharpest)
+        return precision.clamp(min=float(precision.max()) / UNLIKE**2)
 
     @staticmethod
     def _step(gained: torch.Tensor, probed: torch.Tensor, energy: float) -> float:

@@ -1,6 +1,7 @@
 """Compiles csrc/spline.cpp into one shared library per instruction set; the build backend calls build()."""
 
 import platform
+import shutil
 import subprocess
 from pathlib import Path
 
@@ -9,13 +10,16 @@ FLAGS = ("-O3", "-fopenmp", "-fPIC", "-shared", "-std=c++17", "-fno-math-errno",
 VARIANTS = {"base": (), "avx2": ("-mavx2", "-mfma"), "avx512": ("-mavx512f", "-mavx512dq", "-mavx2", "-mfma")}
 
 
-def build(out_dir: Path | str, *, source: Path | str = SOURCE, compiler: str = "g++") -> list[Path]:
+def build(out_dir: Path | str, *, source: Path | str = SOURCE, compiler: str | None = None) -> list[Path]:
     """Compile every variant that this machine's compiler can make into ``out_dir``; returns the files.
 
-    The portable variant must compile; raises FileNotFoundError without a compiler and
-    subprocess.CalledProcessError, with the compiler's words, when the source does not compile. The other two
-    exist on x86-64 only.
+    ``compiler`` None takes g++, or else clang++. Raises FileNotFoundError without a compiler and
+    subprocess.CalledProcessError, with the compiler's words, when the source does not compile. The variants
+    beside the portable one exist on x86-64 only.
     """
+    compiler = compiler or shutil.which("g++") or shutil.which("clang++")
+    if compiler is None:
+        raise FileNotFoundError("neither g++ nor clang++ was found: install one to compile the assembly")
     out_dir = Path(out_dir)
     out_dir.mkdir(parents=True, exist_ok=True)
     names = list(VARIANTS) if platform.machine() in ("x86_64", "AMD64") else ["base"]

@@ -25,7 +25,7 @@ class Problem:
     def field(self, solution: Solution, factor: Factor | None = None, own_factor: bool = True) -> SplineField:
         """The field of a solution; the factor of ``system`` itself also gives its uncertainty."""
         knots, data = self.system.knots, self.data
-        coefficients = solution.x.to(data.velocity).view(knots.nodes, -1).T.reshape(-1, *knots.shape)
+        coefficients = solution.x.to(data.dtype).view(knots.nodes, -1).T.reshape(-1, *knots.shape)
         covered = torch.zeros(prod(knots.cells), dtype=torch.bool)
         covered[self.system.cells()] = True
         posterior = None

@@ -1,4 +1,4 @@
-"""Samples, walls and divergence points, checked and brought to one dtype, ready to become rows."""
+"""Samples, walls and divergence points, checked and brought to float64, ready to become rows."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class FitData:
-    """Samples of positive weight, walls and divergence points inside the box, in one dtype.
+    """Samples of positive weight, walls and divergence points inside the box, in float64.
 
     Points have A columns: D coordinates in m, and the time in s as a last one where the fit runs over it.
     """
@@ -33,6 +33,7 @@ class FitData:
     upper: tuple[float, ...]
     left_out: int  # wall and divergence points beyond a given box
     component_weight: torch.Tensor  # (D,) row factors, root mean square 1: components differ in noise
+    dtype: torch.dtype  # of the velocities as given, and of the field
 
     @classmethod
     def checked(
@@ -47,6 +48,7 @@ class FitData:
         beam: torch.Tensor | None = None,
     ) -> "FitData":
         """Check every array (InvalidInput names the first rule broken) and drop samples of zero weight."""
+        dtype = torch.as_tensor(velocity).dtype
         points, velocity, weight, beam = _checked_samples(points, velocity, weight, beam)
         wall = None if wall is None else wall.to(points.dtype, points.device)
         extra = None if divergence_points is None else torch.as_tensor(divergence_points).to(points)
@@ -72,7 +74,8 @@ class FitData:
                 extra = extra[keep]
         corners = tuple(lower.tolist()), tuple(upper.tolist())
         even = torch.ones_like(velocity[0])
-        return cls(points, velocity, weight**power, beam, wall, extra, *corners, left_out, even)
+        dtype = dtype if dtype.is_floating_point else torch.float64
+        return cls(points, velocity, weight**power, beam, wall, extra, *corners, left_out, even, dtype)
 
     @property
     def components(self) -> int:
@@ -114,9 +117,8 @@ def _checked_samples(
     weight: torch.Tensor | None,
     beam: torch.Tensor | None,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor | None]:
-    velocity = torch.as_tensor(velocity)
-    if not velocity.is_floating_point():
-        velocity = velocity.double()
+    # strong penalties amplify rounding by the condition number: rows are always built in float64
+    velocity = torch.as_tensor(velocity).double()
     points = torch.as_tensor(points).to(velocity)
     shapes = f"points have shape {tuple(points.shape)} and velocity {tuple(velocity.shape)}"
     if velocity.ndim != 2 or velocity.shape[1] not in (2, 3) or points.ndim != 2:
