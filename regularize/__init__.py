@@ -14,6 +14,7 @@ from .lsmr import lsmr
 from .operators import CellRows, DirectionRows, DivergenceRows, System, VectorRows
 from .pcg import pcg
 from .posterior import Posterior
+from .sequence import WindowedField, blur_in_time, fit_windows
 from .smoother import Smoother
 from .sparse import sparse_matrix, sparse_operators
 from .walls import WallRows
@@ -35,7 +36,10 @@ __all__ = [
     "System",
     "VectorRows",
     "WallRows",
+    "WindowedField",
     "basis",
+    "blur_in_time",
+    "fit_windows",
     "lsmr",
     "lsqr",
     "pcg",
