@@ -16,6 +16,7 @@ from torchsph.pairs import (
     backend,
     build,
     native,
+    plan,
     registry,
 )
 from torchsph.pairs import cpu_operators as operators
@@ -40,19 +41,19 @@ class TestOperators:
     def test_pass(self):
         state = disordered(5, 3, torch.float32)
         lists = backend("cpu").search(state.position, state.member, 2.4).lists
-        terms = operators.CONTINUITY | operators.CONCENTRATION | operators.PRESSURE
+        terms = plan.CONTINUITY | plan.CONCENTRATION | plan.PRESSURE
         coefficients = torch.tensor([[1.2, 0.0, 0.0, 0.0]], dtype=torch.float64)
         arrays = (state.position, state.velocity, state.mass, state.deviation, state.pressure, None, None)
         arguments = (
             lists,
             [float("inf")] * 3,
-            [operators.CONTINUITY | operators.CONCENTRATION, 0, 0, 0],
+            [plan.CONTINUITY | plan.CONCENTRATION, 0, 0, 0],
             [2.0, 0.4],
         )
         torch.library.opcheck(
             operators.pair_pass, (*arguments, coefficients, *arrays), test_utils=self.checks
         )
-        assert operators.output_names(terms) == ["divergence", "concentration", "acceleration"]
+        assert plan.Pass(terms, 0).outputs == ["divergence", "concentration", "acceleration"]
 
     def test_interpolation(self):
         state = disordered(5, 2, torch.float64)
@@ -76,7 +77,7 @@ class TestOperators:
         lists = backend("cpu").search(state.position, state.member, 2.4).lists
         coefficients = torch.ones((1, 4), dtype=torch.float64)
         arrays = (state.position, state.velocity, state.mass, state.deviation, None, None, None)
-        terms = operators.SHEPARD | operators.CONTINUITY
+        terms = plan.SHEPARD | plan.CONTINUITY
         with pytest.raises(NotImplementedError, match="0x101"):
             operators.pair_pass(
                 lists, [float("inf")] * 3, [terms, 0, 0, 0], [2.0, 0.4], coefficients, *arrays

@@ -12,37 +12,11 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from . import plan
 from .native import InterpolationArguments, ListArguments, PassArguments, SearchArguments, Sizes, library
 
 CLUSTER = 8
-# sph::Term of csrc/rows.hpp and the outputs that each term fills: name -> trailing shape by dimension
-CONTINUITY, DIFFUSION, CONCENTRATION, XSPH = 1, 2, 4, 8
-PRESSURE, ARTIFICIAL, LAMINAR, TENSILE = 16, 32, 64, 128
-SHEPARD, RENORMALISATION, LAPLACIAN = 256, 512, 1024
-_SCALAR, _VECTOR, _MATRIX = 0, 1, 2
-_OUTPUTS: tuple[tuple[int, str, int], ...] = (
-    (CONTINUITY, "divergence", _SCALAR),
-    (DIFFUSION, "diffusion", _SCALAR),
-    (CONCENTRATION, "concentration", _VECTOR),
-    (XSPH, "xsph", _VECTOR),
-    (PRESSURE | ARTIFICIAL | LAMINAR, "acceleration", _VECTOR),
-    (SHEPARD, "shepard_volume", _SCALAR),
-    (SHEPARD, "shepard_mass", _SCALAR),
-    (RENORMALISATION, "renormalisation", _MATRIX),
-    (LAPLACIAN, "laplacian", _SCALAR),
-    (LAPLACIAN, "diagonal", _SCALAR),
-)
 _REALS = {torch.float32: "f32", torch.float64: "f64"}
-
-
-def output_names(terms: int) -> list[str]:
-    """Names of the sums that ``pair_pass`` returns for ``terms``, in order."""
-    return [name for flag, name, _ in _OUTPUTS if terms & flag]
-
-
-def _allocate(terms: int, position: Tensor) -> list[Tensor]:
-    count, dimension = position.shape
-    return [position.new_empty((count, *(dimension,) * rank)) for flag, _, rank in _OUTPUTS if terms & flag]
 
 
 def _address(tensor: Tensor | None) -> int | None:
@@ -136,11 +110,11 @@ def pair_pass(
         kernel: support in smoothing lengths and sigma_D. coefficients: (members, 4) float64.
 
     Returns:
-        One tensor per name of ``output_names(terms)``.
+        One tensor per name in ``plan.Pass(terms, weight).outputs``.
     """
     slot, owner, entries, offset, home = lists
     terms, weight, form, kind = choice
-    outputs = _allocate(terms, position)
+    outputs = plan.allocate(terms, position)
     given = PassArguments(
         position.shape[1],
         torch.get_num_threads(),
@@ -167,7 +141,7 @@ def pair_pass(
         _address(field),
         _address(active),
     )
-    for name, output in zip(output_names(terms), outputs, strict=True):
+    for name, output in zip(plan.Pass(terms, weight).outputs, outputs, strict=True):
         setattr(given, name, output.data_ptr())
     if library().function("pass", _REALS[position.dtype])(ctypes.byref(given)):
         raise NotImplementedError(f"no compiled pass has exactly the terms {terms:#x}")
@@ -189,7 +163,7 @@ def _(
     field: Tensor | None,
     active: Tensor | None,
 ) -> list[Tensor]:
-    return _allocate(choice[0], position)
+    return plan.allocate(choice[0], position)
 
 
 @torch.library.custom_op("torchsph::interpolation_moments", mutates_args=(), device_types="cpu")
