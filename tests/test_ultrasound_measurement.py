@@ -39,7 +39,6 @@ def estimates(count, generator, variance):
     one = torch.ones(count)
     return Estimates(
         torch.zeros((count, 3)), 0.9 * one, 2 * one, torch.ones((count, 3)),
-        torch.zeros((count, 3)), 0.9 * one, 2 * one, torch.ones((count, 3)),
         variance[:, None].expand(-1, 3), 0 * one, 20 * one,
         torch.ones(count, dtype=torch.long), torch.zeros(count, dtype=torch.int32),
     )  # fmt: skip

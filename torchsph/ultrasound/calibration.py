@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -16,20 +17,28 @@ from torch import Tensor
 from .tracking import Estimates
 
 RIDGE = 1e-2  # pulls coefficients that the data leave open to zero, in units of one observation
+GROUPS = 8  # of training errors, by predicted deviation
 LEAST_VARIANCE = 1e-8  # (m/s)^2: 0.1 mm/s; below it the squares of errors would be round-off
 
 
 @dataclass(frozen=True)
 class VarianceModel:
-    """log variance = features . coefficients, kept within what the fit has seen."""
+    """log variance as a rising function, linear between ``knots`` (score, log variance), of a score.
+
+    The score is features . coefficients; beyond the knots the function is constant, at what the fit has seen.
+    """
 
     coefficients: tuple[float, ...]
-    lowest: float
-    highest: float
+    knots: tuple[tuple[float, float], ...]
 
     def variance(self, table: Tensor) -> Tensor:
         """(n,), (m/s)^2, from features (n, K)."""
-        return (table @ table.new_tensor(self.coefficients)).clamp(self.lowest, self.highest).exp()
+        score = table @ table.new_tensor(self.coefficients)
+        log_variance = torch.full_like(score, self.knots[0][1])
+        for (low, start), (high, end) in pairwise(self.knots):
+            share = ((score - low) / (high - low)).clamp(0, 1)
+            log_variance = log_variance + share * (end - start)
+        return log_variance.exp()
 
 
 @dataclass(frozen=True)
@@ -85,9 +94,9 @@ def fit_calibration(estimates: Estimates, error: Tensor, beam: Tensor) -> Calibr
         share = along if axial else (1 - along) / max(beam.shape[1] - 1, 1)
         square = (error.square() * share).sum(1).clamp_min(LEAST_VARIANCE)
         table = features(estimates, beam, axial)[kept].double().cpu().numpy()
-        coefficients = _fit_log_variance(table, square[kept].double().cpu().numpy())
-        lowest, highest = np.quantile(table @ coefficients, (0.02, 0.98))
-        parts.append(VarianceModel(tuple(coefficients.tolist()), float(lowest), float(highest)))
+        seen = square[kept].double().cpu().numpy()
+        coefficients = _fit_log_variance(table, seen)
+        parts.append(VarianceModel(tuple(coefficients.tolist()), _rising_knots(table @ coefficients, seen)))
     model = Calibration(parts[0], parts[1], 1.0)
     total = model.sigma(estimates, beam)[kept].square().sum(1).median().sqrt()
     return Calibration(model.lateral, model.axial, float(total))
@@ -118,6 +127,28 @@ def _fit_log_variance(table: np.ndarray, square: np.ndarray) -> np.ndarray:
             result[0] -= (coefficients[1:] * centre[1:] / scale[1:]).sum()
             return result
     raise ArithmeticError("the calibration did not converge; use more or other simulations")
+
+
+def _rising_knots(score: np.ndarray, square: np.ndarray) -> tuple[tuple[float, float], ...]:
+    """Mean score and log mean square of ``GROUPS`` groups by score, neighbours that fall being pooled."""
+    pools: list[list[float]] = []  # score, mean square, members
+    for group in np.array_split(np.argsort(score), GROUPS):
+        if len(group) == 0:
+            continue
+        pools.append([float(score[group].mean()), float(square[group].mean()), len(group)])
+        while len(pools) > 1 and (pools[-1][1] <= pools[-2][1] or pools[-1][0] <= pools[-2][0]):
+            last, before = pools.pop(), pools.pop()
+            members = last[2] + before[2]
+            pools.append(
+                [
+                    *(
+                        (a * last[2] + b * before[2]) / members
+                        for a, b in zip(last[:2], before[:2], strict=True)
+                    ),
+                    members,
+                ]
+            )
+    return tuple((place, math.log(max(level, LEAST_VARIANCE))) for place, level, _ in pools)
 
 
 def joined(parts: list[Estimates]) -> Estimates:
