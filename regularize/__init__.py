@@ -3,6 +3,7 @@
 Knows numpy, scipy and torch only; walls come in as arrays (:class:`WallRows`).
 """
 
+from .block import BlockFactor
 from .bspline import basis
 from .direct import Factor, PreparedSystem, solve_direct
 from .errors import InvalidInput, NotConverged
@@ -20,6 +21,7 @@ from .sparse import sparse_matrix, sparse_operators
 from .walls import WallRows
 
 __all__ = [
+    "BlockFactor",
     "CellRows",
     "Choice",
     "DirectionRows",

@@ -19,7 +19,8 @@ def empty_band(system: System, ordering: Ordering) -> torch.Tensor:
     transpose is LAPACK's lower band storage without a copy.
     """
     c = system.components
-    band = torch.zeros(len(ordering.nodes) * c, (ordering.half_bandwidth + 1) * c, dtype=torch.float64)
+    shape = (len(ordering.nodes) * c, (ordering.half_bandwidth + 1) * c)
+    band = torch.zeros(shape, dtype=torch.float64, device=ordering.nodes.device)
     band[:, 0] = system.damping**2
     return band
 
@@ -40,14 +41,15 @@ def cell_gram(block: CellRows) -> torch.Tensor:
     factor = block.factor.double()
     if block.coupled:
         return torch.einsum("rlc,rmd->lcmd", factor, factor)
-    return torch.einsum("rl,rm,cd->lcmd", factor, factor, torch.eye(block.components).double())
+    return torch.einsum("rl,rm,cd->lcmd", factor, factor, torch.eye(block.components).to(factor))
 
 
 def _scatter(band: torch.Tensor, gram: torch.Tensor, c: int, ordering: Ordering, part: slice) -> None:
     """Add blocks (cells, L C, L C), local coefficients in array order, to the lower band."""
-    unknown = (ordering.position[part][:, :, None] * c + torch.arange(c)).flatten(1)
-    permuted = (ordering.local()[:, None] * c + torch.arange(c)).flatten()
-    row, column = torch.tril_indices(len(permuted), len(permuted)).unbind()
+    component = torch.arange(c, device=band.device)
+    unknown = (ordering.position[part][:, :, None] * c + component).flatten(1)
+    permuted = (ordering.local()[:, None] * c + component).flatten()
+    row, column = torch.tril_indices(len(permuted), len(permuted), device=band.device).unbind()
     i, j = unknown[:, row], unknown[:, column]
     values = gram[:, permuted[row], permuted[column]]
     band.view(-1).index_add_(0, (j * band.shape[1] + i - j).flatten(), values.flatten())
@@ -60,7 +62,8 @@ class _CellGroups:
         self.block, self.components, self.size = block, components, ordering.knots.local_size
         slot = ordering.slots(block.cell)
         self.sorted = torch.argsort(slot, stable=True)
-        self.start = torch.searchsorted(slot[self.sorted], torch.arange(len(ordering.keys) + 1))
+        edges = torch.arange(len(ordering.keys) + 1, device=slot.device)
+        self.start = torch.searchsorted(slot[self.sorted], edges)
 
     def gram(self, part: slice) -> torch.Tensor:
         """(cells, L C, L C) sum over the rows of each cell."""
@@ -68,8 +71,9 @@ class _CellGroups:
         if isinstance(self.block, CellRows):
             one = cell_gram(self.block).flatten(0, 1).flatten(1, 2)
             return counts.double()[:, None, None] * one
-        total = torch.zeros(len(counts), *(self.size, self.components) * 2, dtype=torch.float64)
-        slots = torch.arange(int(counts.max()))
+        shape = (len(counts), *(self.size, self.components) * 2)
+        total = torch.zeros(shape, dtype=torch.float64, device=counts.device)
+        slots = torch.arange(int(counts.max()), device=counts.device)
         if len(slots) > 0:
             valid = slots < counts[:, None]
             rows = self.sorted[torch.where(valid, self.start[part, None] + slots, 0).flatten()]

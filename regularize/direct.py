@@ -8,6 +8,7 @@ from scipy.linalg.blas import dtbsv
 
 from . import native
 from .assembly import reference_band
+from .block import BlockFactor
 from .errors import InvalidInput, NotConverged
 from .krylov import Solution
 from .operators import System
@@ -28,7 +29,8 @@ class PreparedSystem:
         self.ordering = order(system) if ordering is None else ordering
         if engine == "native" and not native.available():
             raise InvalidInput("engine is 'native' but no compiled library was built; use 'reference'")
-        self.engine = engine or ("native" if native.available() else "reference")
+        on_cpu = self.ordering.nodes.device.type == "cpu"
+        self.engine = engine or ("native" if native.available() and on_cpu else "reference")
         self._packed = native.PackedSystem(system, self.ordering) if self.engine == "native" else None
 
     def with_targets(self, system: System) -> "PreparedSystem":
@@ -44,20 +46,21 @@ class PreparedSystem:
         """Lower band (unknowns, width) of the normal matrix, float64."""
         return reference_band(self.system, self.ordering) if self._packed is None else self._packed.band()
 
-    def factor(self) -> "Factor":
+    def factor(self) -> "Factor | BlockFactor":
         """Cholesky factor of the normal matrix; InvalidInput where it is not positive definite.
 
         Penalties many orders stronger than the damping can lose it to round-off: then the diagonal is raised
         by SHIFT of its largest entry, which the refinement on the rows has to make good for.
         """
+        kind = Factor if self.ordering.nodes.device.type == "cpu" else BlockFactor
         try:
-            return Factor(self.band(), self.ordering)
+            return kind(self.band(), self.ordering)
         except InvalidInput:
             if self.system.damping == 0:
                 raise
             band = self.band()
             band[:, 0] += SHIFT * band[:, 0].max()
-            return Factor(band, self.ordering)
+            return kind(band, self.ordering)
 
     def gradient(self, x: torch.Tensor | None = None) -> torch.Tensor:
         """A'(b - A x) - damping^2 x, or A'b."""

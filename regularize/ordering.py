@@ -40,7 +40,8 @@ class Ordering:
         """(L,) array-order place of each solve-order local coefficient."""
         array_axes = [self.knots.axes - 1 - axis for axis in self.axes]
         size = (self.knots.degree + 1,) * self.knots.axes
-        return torch.arange(self.knots.local_size).view(size).permute(array_axes).flatten()
+        local = torch.arange(self.knots.local_size, device=self.keys.device)
+        return local.view(size).permute(array_axes).flatten()
 
     def slabs(self) -> torch.Tensor:
         """(slabs + 1,) starts in ``keys`` of runs of degree + 1 cell layers along the slowest axis.

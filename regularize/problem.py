@@ -26,10 +26,10 @@ class Problem:
         """The field of a solution; the factor of ``system`` itself also gives its uncertainty."""
         knots, data = self.system.knots, self.data
         coefficients = solution.x.to(data.dtype).view(knots.nodes, -1).T.reshape(-1, *knots.shape)
-        covered = torch.zeros(prod(knots.cells), dtype=torch.bool)
+        covered = torch.zeros(prod(knots.cells), dtype=torch.bool, device=coefficients.device)
         covered[self.system.cells()] = True
         posterior = None
-        if factor is not None and own_factor:
+        if isinstance(factor, Factor) and own_factor:  # on a GPU there is no selected inverse yet
             posterior = Posterior(factor, self.precision(solution), self.system.components)
         return SplineField(
             knots, coefficients, covered, solution, data.left_out, self.choice, posterior, factor

@@ -91,7 +91,14 @@ class FitData:
         precision = torch.tensor(choice.noise, dtype=torch.float64) ** -2
         each = (precision / precision.mean()).sqrt().to(self.points)
         # discarded samples stay as rows of weight 0: the field remains defined where they lie
-        return replace(self, weight=self.weight * choice.robust.sqrt(), component_weight=each)
+        factor = choice.robust.sqrt().to(self.weight)
+        return replace(self, weight=self.weight * factor, component_weight=each)
+
+    def cpu(self) -> "FitData":
+        """The same data on the CPU."""
+        move = {name: value.cpu() for name, value in vars(self).items() if isinstance(value, torch.Tensor)}
+        wall = None if self.wall is None else self.wall.to(torch.float64, "cpu")
+        return replace(self, wall=wall, **move)
 
     def extent(self, knots: Knots) -> float:
         """Volume (times duration) over which penalties are averaged; one knot cell's for flat data."""

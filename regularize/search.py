@@ -22,6 +22,7 @@ def choose(options: "Smoother", knots: Knots, data: FitData) -> Choice | None:
 
     None where there is nothing to choose from: fewer than FEWEST samples, or no flow at all.
     """
+    data = data.cpu()  # small dense work, and LAPACK's banded routines
     guess = 0.5 * float(data.velocity.double().square().mean().sqrt())
     if len(data.points) < FEWEST or guess == 0:
         return None

@@ -7,6 +7,7 @@ import torch
 from regularize_cases import blocks_of, make
 
 from regularize import (
+    BlockFactor,
     InvalidInput,
     Knots,
     PreparedSystem,
@@ -102,6 +103,27 @@ def test_factor_serves_many_right_hand_sides():
     assert torch.allclose(both[..., 1], 2 * both[..., 0]) and torch.allclose(
         both[..., 0], factor.solve(right)
     )
+
+
+@pytest.mark.parametrize("axes,degree", [(2, 3), (3, 2), (2, 1)])
+def test_block_tridiagonal_factor_equals_the_banded_one(axes, degree):
+    knots, blocks = blocks_of(axes, degree)
+    long = Knots(knots.origin, knots.spacing, (40, *knots.cells[1:]), degree)
+    points = torch.rand(400, axes, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    points = points * torch.tensor(long.spacing).double() * torch.tensor(long.cells)
+    weight = torch.ones(400, 1, dtype=torch.float64)
+    prepared = PreparedSystem(System(long, axes, [VectorRows(long, points, points, weight)], 0.3))
+    banded, block = prepared.factor(), BlockFactor(prepared.band(), prepared.ordering)
+    right = torch.randn(
+        len(prepared.ordering.nodes), axes, 3, generator=torch.Generator().manual_seed(1)
+    ).double()
+    assert torch.allclose(block.solve(right), banded.solve(right), atol=1e-10)
+    assert torch.allclose(block.solve(right[..., 0]), banded.solve(right[..., 0]), atol=1e-10)
+    assert block.log_determinant() == pytest.approx(banded.log_determinant(), rel=1e-12)
+    assert torch.allclose(block.diagonal(), banded.diagonal())
+    assert len(block._lower) > 2
+    with pytest.raises(InvalidInput, match="positive definite"):
+        BlockFactor(-prepared.band(), prepared.ordering)
 
 
 def test_coefficients_without_rows_stay_zero():
