@@ -154,7 +154,7 @@ def test_a_beam_of_another_dimension_is_refused():
 
 @pytest.mark.slow
 def test_deviations_hold_in_each_third_of_the_weight_on_held_out_simulations():
-    """The issue's target: z-scores with deviations of 0.8 to 1.25 in every third."""
+    """z-scores have deviations of 0.8 to 1.25 in every third of the weight."""
     model, tracker, spacing = EchoModel(), SpeckleTracker(), (1e-3 / 6,) * 3
     calibration = calibrate(model, tracker, spacing, torch.Generator().manual_seed(0))
     plan = TrainingPlan()

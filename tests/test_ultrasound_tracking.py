@@ -96,7 +96,7 @@ def test_two_separate_peaks_are_told_by_their_ratio():
 
 @pytest.mark.parametrize("velocity", [(0.31, 0.17, 0.23), (-0.62, 0.44, 0.51)])
 def test_uniform_motion_is_measured_within_the_stated_error(velocity):
-    """The issue's target: |bias| <= 1 % of the speed, deviation <= 5 % lateral and 1 % axial of 1 m/s."""
+    """Targets: |bias| <= 1 % of the speed, deviation <= 5 % lateral and 1 % axial of 1 m/s."""
     points, errors = lattice(), []
     for seed in range(3):
         found = PLAIN.track(packet(velocity, seed), points)

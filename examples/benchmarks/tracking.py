@@ -243,9 +243,8 @@ def speed(out: Path) -> dict:
 
         def openpiv() -> None:
             for first, second in zip(frames[:3], frames[1:4], strict=False):
-                found = extended_search_area_piv3D(
-                    first, second, (7,) * 3, (1,) * 3, search_area_size=(11,) * 3, verbose=False
-                )
+                sizes = {"window_size": (7,) * 3, "overlap": (1,) * 3, "search_area_size": (11,) * 3}
+                found = extended_search_area_piv3D(first, second, **sizes)
                 count.append(np.asarray(found[0]).size)
 
         rows["OpenPIV, 15 pairs"] = 1e3 * seconds(openpiv) / count[0] * 15 / 3

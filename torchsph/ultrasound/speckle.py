@@ -23,7 +23,7 @@ class SpeckleOptions(ScannerOptions):
 
     kernel: float = 1e-3
     search: float = 1.0
-    training: int = 8
+    training: int = 12
 
     def __post_init__(self) -> None:
         super().__post_init__()

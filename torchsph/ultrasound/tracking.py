@@ -50,7 +50,9 @@ class SpeckleTracker:
     min_snr: least power over that of thermal noise after the filter, dB, where the packet states its noise;
         ``None`` = no gate. min_blood: least share of the unfiltered power that passes the filter, dB, or
         ``None``.
-    min_correlation: least correlation. tile: points correlated at a time, which bounds memory.
+    min_correlation: least correlation; lone_correlation: the same where no longer lag confirms the first,
+        whose axial phase may then be a whole turn off. tile: points correlated at a time, which bounds
+        memory.
     """
 
     kernel: float = 1e-3
@@ -63,6 +65,7 @@ class SpeckleTracker:
     min_snr: float | None = 3.0
     min_blood: float | None = -60.0
     min_correlation: float = 0.7
+    lone_correlation: float = 0.8
     tile: int = 128
 
     def __post_init__(self) -> None:
@@ -73,8 +76,9 @@ class SpeckleTracker:
             raise ValueError("min_samples must be >= 3 and tile >= 1")
         if not self.lags or list(self.lags) != sorted(set(self.lags)) or self.lags[0] < 1:
             raise ValueError(f"lags must be increasing whole numbers >= 1, got {self.lags!r}")
-        if not 0 <= self.min_correlation < 1:
-            raise ValueError(f"min_correlation must lie in [0, 1), got {self.min_correlation!r}")
+        for name in ("min_correlation", "lone_correlation"):
+            if not 0 <= getattr(self, name) < 1:
+                raise ValueError(f"{name} must lie in [0, 1), got {getattr(self, name)!r}")
 
     def track(self, packet: Packet, points: Tensor) -> Estimates:
         """Velocities at the image nodes nearest to ``points`` (n, D), m. See :func:`track`."""
@@ -260,7 +264,11 @@ def _track_tile(
     flags = flags | _bit(~state.sound, Flag.FLAT)
     # a fit that overshoots by 2 % of the range is still the range's own edge
     flags |= _bit((velocity.abs() > options.search * 1.02).any(1) & state.sound, Flag.EDGE)
-    flags |= _bit(state.correlation < options.min_correlation, Flag.DECORRELATED)
+    alone = (state.lag == options.lags[0]) & (len(options.lags) > 1)
+    least = torch.where(
+        alone, max(options.lone_correlation, options.min_correlation), options.min_correlation
+    )
+    flags |= _bit(state.correlation < least, Flag.DECORRELATED)
     return (
         velocity, state.correlation, state.peak_ratio, state.curvature[:, active].flip(-1),
         state.variance[:, active].flip(-1) / interval**2, power, snr, state.lag, flags,

@@ -81,8 +81,8 @@ class TrainingPlan:
     tissue_speed: deviation of each component of the tissue's velocity, m/s.
     """
 
-    simulations: int = 8
-    radius: float = 5e-3
+    simulations: int = 12
+    radius: float = 4e-3
     margin: float = 1.5e-3
     step: float = 1e-3
     slowest: float = 0.05
