@@ -134,7 +134,7 @@ def _shape_at(support: Support, distance: float) -> Tensor:
 
 
 def kernel_choice(support: Support, backend: str) -> tuple[int, list[float]]:
-    """Index in ``KERNEL_ORDER``, and support in smoothing lengths with sigma_D, of a kernel that is compiled in.
+    """Index in ``KERNEL_ORDER``, and support in smoothing lengths with sigma_D, of a compiled-in kernel.
 
     Raises:
         ValueError: the kernel is not one of ``torchsph.smoothing``.

@@ -82,7 +82,7 @@ class PlannedBackend(Backend):
             )
 
     def check(self, *tensors: Tensor) -> None:
-        """ValueError or TypeError unless all tensors are of one real type, on this device, without gradient."""
+        """ValueError or TypeError unless all tensors are of one real type, here, without gradient."""
         kind = tensors[0].dtype
         for tensor in tensors:
             if tensor.device.type != self.device:

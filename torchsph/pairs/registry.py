@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import torch
 
+from . import cuda
 from .cpu import CpuBackend
 from .interface import Backend
 from .native import LibraryMissing, library
@@ -24,7 +25,7 @@ class BackendStatus:
 def available_backends(device: str = "cpu") -> list[BackendStatus]:
     """The known backends, best first, each with the reason why it can or cannot be used on ``device``."""
     reference = BackendStatus("reference", True, "plain torch, any device, always present")
-    return [_cpu_status(device), reference]
+    return [BackendStatus("cuda", *cuda.status(device)), _cpu_status(device), reference]
 
 
 def _cpu_status(device: str) -> BackendStatus:
@@ -56,4 +57,4 @@ def backend(name: str = "auto", device: str = "cpu") -> Backend:
 
 
 def _make(name: str) -> Backend:
-    return {"cpu": CpuBackend, "reference": ReferenceBackend}[name]()
+    return {"cuda": cuda.CudaBackend, "cpu": CpuBackend, "reference": ReferenceBackend}[name]()
