@@ -2,9 +2,10 @@
 
 from copy import copy
 
+import numpy as np
 import torch
 from scipy.linalg import LinAlgError, cho_solve_banded, cholesky_banded
-from scipy.linalg.blas import dtbsv
+from scipy.linalg.blas import dtbmv, dtbsv
 
 from . import native
 from .assembly import reference_band
@@ -100,6 +101,12 @@ class Factor:
         flat = right.double().reshape(right.shape[0] * right.shape[1], *right.shape[2:])
         solved = cho_solve_banded((self.band, True), flat.numpy(), check_finite=False)
         return torch.from_numpy(solved).view(right.shape)
+
+    def spread(self, white: torch.Tensor) -> torch.Tensor:
+        """The factor times white (unknowns, k): draws whose covariance is the factored matrix."""
+        half = self.band.shape[0] - 1
+        columns = [dtbmv(half, self.band, z, lower=1) for z in white.T.contiguous().numpy()]
+        return torch.from_numpy(np.stack(columns, axis=1))
 
     def sample(self, precision: float, generator: torch.Generator) -> torch.Tensor:
         """(active, C) Gaussian draw of mean 0 with ``precision`` times the factored matrix as precision."""

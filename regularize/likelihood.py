@@ -17,13 +17,13 @@ from dataclasses import dataclass
 import torch
 
 from .banded import multiply, widen
-from .direct import Factor, PreparedSystem
+from .direct import SHIFT, Factor, PreparedSystem
 from .knots import Knots
 from .operators import CellRows, RowBlock, System, VectorRows
 from .ordering import Ordering, order
 from .robust import inflation, robust_weight
 
-PROBES = 16  # Rademacher vectors per trace: its error is about sqrt(2 / (PROBES unknowns)), under 1 %
+PROBES = 8  # random sums of rows per trace: its error is about sqrt(2 / (PROBES unknowns)), near 1 %
 RELAXATION = 1.6  # the plain update converges from one side at a rate near 0.6
 UNLIKE = 10.0  # no component is taken for more than this many times noisier than another
 MOST_PER_ROUND = 1e3  # growth of a precision, where a penalty's energy vanishes
@@ -69,7 +69,7 @@ class _Alike:
     """A group that acts alike on every component: one scalar band serves them all."""
 
     def __init__(self, block: VectorRows | CellRows, ordering: Ordering) -> None:
-        knots = ordering.knots
+        knots, self.block, self.ordering = ordering.knots, block, ordering
         if isinstance(block, CellRows):
             self.band = PreparedSystem(System(knots, 1, [block], 0.0), ordering).band()
             self.right = self.size = 0.0
@@ -82,6 +82,18 @@ class _Alike:
     def times(self, x: torch.Tensor) -> torch.Tensor:
         """Normal matrix times x (active, ...)."""
         return multiply(self.band, x.reshape(len(x), -1)).view(x.shape)
+
+    def probes(self, components: int, generator: torch.Generator) -> torch.Tensor:
+        """(active, C, PROBES) draws u with E[u u'] = the group's normal matrix: its rows' random sums.
+
+        tr(M^-1 G) = E[u' M^-1 u] has a small variance where M holds G; with signs on the coefficients,
+        directions that M hardly knows would drown it.
+        """
+        width = components * PROBES
+        rows = self.block.repeated(width)
+        signs = torch.randint(0, 2, rows.target.shape, generator=generator).double() * 2 - 1
+        summed = rows.rmatvec(signs)[self.ordering.nodes]
+        return summed.view(-1, components, PROBES)
 
     def energy(self, x: torch.Tensor) -> float:
         """Sum of the squared row residuals at x (active, C)."""
@@ -104,11 +116,12 @@ class LikelihoodSearch:
         fixed = System(knots, self.components, [silent, *groups.fixed], groups.damping)
         fixed = PreparedSystem(fixed, self.ordering)
         self.fixed, self.fixed_right = fixed.band(), fixed.gradient()
-        shape = (len(self.ordering.nodes), self.components, PROBES)
         generator = torch.Generator().manual_seed(0)  # fixed probes: the same data give the same choice
-        self.probes = torch.randint(0, 2, shape, generator=generator).double() * 2 - 1
-        self.curvature_probes = self.curvature.times(self.probes)
-        self.slip_probes = None if self.slip is None else self.slip.times(self.probes)
+        shape = (len(self.ordering.nodes), self.components * PROBES)
+        self.signs = torch.randint(0, 2, shape, generator=generator).double() * 2 - 1
+        self.rough_probes = self.curvature.probes(self.components, generator)
+        if self.slip is not None:
+            self.slip_probes = self.slip.probes(self.components, generator)
         self._weigh(torch.ones_like(groups.weight))
         speed = float(groups.velocity.double().square().mean().sqrt())
         self.sharpest = (NOISE_FLOOR * speed) ** -2
@@ -136,13 +149,12 @@ class LikelihoodSearch:
         posterior = Factor(prior + widen(self.data.band, fit), self.ordering)
         prior = Factor(prior, self.ordering)
         x = posterior.solve(right + fit * self.data.right)
-        known, all_known = prior.solve(self.probes), posterior.solve(self.probes)
-        new_fit, gained = self._noise(x, fit, all_known), known - all_known
+        new_fit = self._noise(x, fit, posterior)
         low, high = (self._scale(fit) * (factor * self.step) ** 4 for factor in (SHARPEST, 1 / SHARPEST))
-        rough *= self._step(gained, self.curvature_probes, self.curvature.energy(x))
+        rough *= self._step(prior, posterior, self.rough_probes, self.curvature.energy(x))
         rough = min(max(rough, low), high)
         if slip > 0:
-            slip *= self._step(gained, self.slip_probes, self.slip.energy(x))
+            slip *= self._step(prior, posterior, self.slip_probes, self.slip.energy(x))
             slip = min(slip, self._scale(fit) / SHARPEST**2)
         if self.robust is not None:
             self._reweigh(x)
@@ -156,12 +168,14 @@ class LikelihoodSearch:
         if slip > 0:
             prior += widen(self.slip.band, slip * one)
             right = right + slip * self.slip.right
+        # stiff penalties over a breath of damping may lose definiteness to round-off
+        prior[:, 0] += SHIFT * prior[:, 0].max()
         return prior, right
 
-    def _noise(self, x: torch.Tensor, fit: torch.Tensor, all_known: torch.Tensor) -> torch.Tensor:
+    def _noise(self, x: torch.Tensor, fit: torch.Tensor, posterior: Factor) -> torch.Tensor:
         """(C,) new precisions of the samples: what they determine over how far the fit stays from them."""
         # tr(A^-1 S_k): how much of component k's data the posterior leaves free
-        freed = (all_known * self.data.times(self.probes)).sum(dim=(0, 2)) / PROBES
+        freed = (self.data_probes * posterior.solve(self.data_probes)).sum(dim=(0, 2)) / PROBES
         off = x - self.unpenalised
         misfit = (off * self.data.times(off)).sum(dim=0)
         precision = (self.rank - fit * freed).clamp(min=1.0) / misfit.clamp(min=1e-300)
@@ -171,9 +185,10 @@ class LikelihoodSearch:
         return precision.clamp(min=float(precision.max()) / UNLIKE**2)
 
     @staticmethod
-    def _step(gained: torch.Tensor, probed: torch.Tensor, energy: float) -> float:
+    def _step(prior: Factor, posterior: Factor, probes: torch.Tensor, energy: float) -> float:
         """Factor on a penalty's precision: (tr(P^-1 G) - tr(A^-1 G)) over its energy, over-relaxed."""
-        trace = float((gained * probed).sum()) / PROBES
+        gained = prior.solve(probes) - posterior.solve(probes)
+        trace = float((probes * gained).sum()) / PROBES
         return min((max(trace, 1e-30) / max(energy, 1e-30)) ** RELAXATION, MOST_PER_ROUND)
 
     def _scale(self, fit: torch.Tensor) -> float:
@@ -194,8 +209,10 @@ class LikelihoodSearch:
         ridge = (RIDGE * self.step) ** 4 * float(weight.double().square().sum())
         factor = Factor(self.data.band + ridge * self.curvature.band, self.ordering)
         self.unpenalised = factor.solve(self.data.right[:, None]).squeeze(1)
-        probe = self.probes[:, :1]
-        self.rank = float((factor.solve(probe) * self.data.times(probe)).sum()) / PROBES
+        # rank = tr((S + R)^-1 S) = unknowns - tr((S + R)^-1 R) for the ridge R
+        probe = self.rough_probes[:, :1]
+        self.rank = len(probe) - ridge * float((probe * factor.solve(probe)).sum()) / PROBES
+        self.data_probes = factor.spread(self.signs).view(len(probe), self.components, PROBES)
 
     @staticmethod
     def _settled(old: tuple, new: tuple) -> bool:

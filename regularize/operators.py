@@ -103,6 +103,14 @@ class VectorRows(_PointRows):
         other.weight = torch.ones_like(other.weight)
         return other
 
+    def repeated(self, count: int) -> "VectorRows":
+        """The same rows, of one weight per point, for ``count`` components and no target."""
+        other = object.__new__(VectorRows)
+        other.__dict__.update(self.__dict__)
+        other.components, other.weight = count, self.weight[:, :1].expand(-1, count)
+        other.target = torch.zeros(len(self) * count, dtype=self.target.dtype)
+        return other
+
     def component(self, k: int) -> "VectorRows":
         """The rows of one component, as rows of a scalar field."""
         one = object.__new__(VectorRows)
@@ -197,6 +205,10 @@ class CellRows:
             values = torch.einsum("rl,nrc->nlc", factor, r.view(count, len(factor), -1)).flatten(0, 1)
         out = torch.zeros(self.knots.nodes, self.components, dtype=r.dtype, device=r.device)
         return out.index_add_(0, self.nodes.flatten(), values)
+
+    def repeated(self, count: int) -> "CellRows":
+        """The same uncoupled rows for ``count`` components."""
+        return CellRows(self.knots, self.cell, self.factor, count)
 
 
 class System:

@@ -3,6 +3,7 @@
 Twice the memory of one copy, but A' u then runs as fast as A v. The matrix-free operators need neither.
 """
 
+import warnings
 from collections.abc import Callable
 
 import torch
@@ -24,7 +25,9 @@ def sparse_matrix(system: System) -> torch.Tensor:
         offset += count
     index = torch.stack([torch.cat(rows), torch.cat(columns)])
     shape = (offset, system.unknowns)
-    return torch.sparse_coo_tensor(index, torch.cat(values), shape, check_invariants=False).to_sparse_csr()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # torch calls its CSR format a beta, once per process
+        return torch.sparse_coo_tensor(index, torch.cat(values), shape).to_sparse_csr()
 
 
 def sparse_operators(system: System) -> tuple[Apply, Apply]:
