@@ -26,7 +26,8 @@ class EnsembleOptions:
 
     Attributes:
         initial_spread: RMS per component of the first perturbations, share of the first field's RMS per component.
-        model_error: the same for the perturbations added to every forecast, share of the mean's RMS.
+        model_error: the same for the perturbations added to every forecast, share of the RMS of the forecast's mean
+            or of all splines, whichever is larger.
         length: correlation length of both, in mean grid spacings.
         localisation: radius at which observations lose all influence, share of the walls' longest extent.
         relaxation: RTPS factor. gross_error: rejection limit in expected standard deviations, or None.
@@ -41,9 +42,9 @@ class EnsembleOptions:
     length: float = 2.0
     localisation: float = 0.33
     relaxation: float = 0.5
-    gross_error: float | None = 4.0
+    gross_error: float | None = None
     spline_share: float = 0.5
-    choose_every: int = 4
+    choose_every: int = 3
     memory: float = 5.0
     transfer: Transfer = Transfer(detail="static")
 
@@ -100,8 +101,8 @@ def assimilate(
     splines = FrameSmoother(measured, regularize.Smoother()) if splines is None else splines
     smoothed = smooth_frames(splines, progress) if smoothed is None else smoothed
     cycle = _Cycle(model, members, filter or default_filter(measured, options), options, splines,
-                   estimate_error(measured, smoothed, splines.choice), torch.Generator().manual_seed(seed))
-    cycle.begin(smoothed.velocity[0])
+                   estimate_error(measured, splines, smoothed), torch.Generator().manual_seed(seed))
+    cycle.begin(smoothed)
     frames = tqdm(range(1, measured.frames), desc="ensemble", unit="frame", disable=None if progress else True)
     for frame in frames:
         cycle.step(frame, seed)
@@ -118,8 +119,7 @@ class _Cycle:
         measured = splines.recording
         self.measured, self.model, self.members, self.filter = measured, model, members, filter_
         self.options, self.error, self.generator = options, error, generator
-        # innovations have a smoothness of their own, chosen from them as the cycle goes
-        self.increments = FrameSmoother(measured, splines.smoother)
+        self.splines, self.increment_choice = splines, None
         self.grid = measured.grid
         self.nodes = self.grid.nodes()
         self.length = options.length * float(np.mean(self.grid.spacing))
@@ -133,15 +133,17 @@ class _Cycle:
     def mask(self, frame: int) -> np.ndarray:
         return np.asarray(self.measured.mask[frame], bool)
 
-    def begin(self, field: np.ndarray) -> None:
+    def begin(self, smoothed: geometry.Recording) -> None:
         mask = self.mask(0)
-        mean = torch.from_numpy(np.where(mask, field, 0.0))
+        mean = torch.from_numpy(np.where(mask, smoothed.velocity[0], 0.0))
+        inside = np.moveaxis(smoothed.velocity, 1, -1)[np.asarray(smoothed.mask, bool)]
+        self.usual = float(np.sqrt(np.mean(np.square(inside, dtype=np.float64))))
         self.ensemble = mean + self._perturbations(0, mean, self.options.initial_spread)
         self._keep(mean.numpy(), self.ensemble.std(0).numpy(), 0)
 
-    def _perturbations(self, frame: int, mean: Tensor, share: float) -> Tensor:
+    def _perturbations(self, frame: int, mean: Tensor, share: float, least: float = 0.0) -> Tensor:
         mask = self.mask(frame)
-        rms = float(mean[:, torch.from_numpy(mask)].square().mean().sqrt())
+        rms = max(float(mean[:, torch.from_numpy(mask)].square().mean().sqrt()), least)
         return flow_perturbations(
             self.members, mask, self.grid.spacing, share * rms, self.length, self.generator
         ).to(mean.dtype)
@@ -161,7 +163,7 @@ class _Cycle:
             )
             self.replaced += int(failed.sum())
         if self.options.model_error > 0:
-            forecast = forecast + self._perturbations(frame, forecast.mean(0), self.options.model_error)
+            forecast = forecast + self._perturbations(frame, forecast.mean(0), self.options.model_error, self.usual)
         self._analyse(forecast, frame, int((late & ~covered[0].cpu()).sum()))
 
     def _analyse(self, forecast: Tensor, frame: int, missing: int) -> None:
@@ -202,7 +204,8 @@ class _Cycle:
         spread = torch.from_numpy(variance).flatten(1)[:, inside]
         value = torch.where(torch.isfinite(spread), value, torch.nan)
         return Observations(
-            value.flatten(), spread.flatten(), position=self.nodes[inside], redundancy=float(self.error.redundancy)
+            value.flatten(), spread.flatten(), position=self.nodes[inside],
+            redundancy=float(self.error.redundancy[frame])
         )
 
     def _learn_scale(self, analysis: Analysis, state: Tensor) -> None:
@@ -232,12 +235,13 @@ class _Cycle:
             if not (weight > 0).any():
                 return mean
             shape = self.grid.shape
-            fitted = self.increments.fit(
-                frame, innovation.reshape(parts, *shape), weight.reshape(shape), at_rest=True,
-                anew=frame % self.options.choose_every == 1 or self.options.choose_every == 1,
+            # innovations have a smoothness of their own, chosen from them as the cycle goes
+            anew = (frame - 1) % self.options.choose_every == 0
+            fitted = self.splines.fit_increment(
+                frame, innovation.reshape(parts, *shape), weight.reshape(shape), None if anew else self.increment_choice
             )
-            self.increments.choice = fitted.choice
-            change = self.increments.on_grid(fitted, frame)
+            self.increment_choice = fitted.choice
+            change = self.splines.on_grid(fitted, frame)
             return mean + torch.from_numpy(change).reshape(parts, -1)[:, inside].flatten().to(mean.dtype)
 
         return analyse

@@ -10,10 +10,11 @@ from torch import Tensor
 from tqdm import tqdm
 
 import geometry
+import regularize
 
 from .observation_error import ObservationError, estimate_error
 from .simulator import Simulation, Simulator
-from .smooth import node_weights, smooth
+from .smooth import FrameSmoother, node_weights, smooth_frames
 
 # share of the innovation's variance that the forecast keeps for itself at least: it is never believed blindly
 _LEAST_FORECAST_SHARE = 0.05
@@ -43,7 +44,9 @@ def filter_sph(
     Returns:
         The fetched grid after each frame's update, on the measurement's grid, mask and times.
     """
-    error = estimate_error(measured, smooth(measured, progress=progress)) if error is None else error
+    if error is None:
+        splines = FrameSmoother(measured, regularize.Smoother())
+        error = estimate_error(measured, splines, smooth_frames(splines, progress))
     run = model.start(float(measured.time[0]), seed=seed)
     fields, missing = [], []
     frames = tqdm(range(measured.frames), desc="sph", unit="frame", disable=None if progress else True)

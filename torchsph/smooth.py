@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import torch
 from tqdm import tqdm
@@ -13,8 +11,9 @@ import regularize
 
 from .wall_rows import wall_rows
 
-# frames, spread over the recording, from which its noise and smoothness are chosen
-CHOICE_FRAMES = 3
+# noise and smoothness are chosen in every third frame and serve its neighbours: flow and noise change over tens of
+# milliseconds, and a choice costs four times a fit
+CHOICE_EVERY = 3
 
 
 def node_weights(recording: geometry.Recording, frame: int) -> np.ndarray:
@@ -26,42 +25,52 @@ def node_weights(recording: geometry.Recording, frame: int) -> np.ndarray:
 
 
 class FrameSmoother:
-    """Spline fits of a recording's frames that share what was chosen automatically.
+    """Spline fits of a recording's frames; neighbouring frames share what was chosen automatically.
 
     Args:
-        recording: the measurement. smoother: options of the fit. choice: noise and smoothness chosen before, or None.
+        recording: the measurement. smoother: options of the fit. choose_every: frames that share one choice.
     """
 
     def __init__(
-        self, recording: geometry.Recording, smoother: regularize.Smoother,
-        choice: regularize.Choice | None = None,
+        self, recording: geometry.Recording, smoother: regularize.Smoother, choose_every: int = CHOICE_EVERY
     ) -> None:
-        self.recording, self.smoother, self.choice = recording, smoother, choice
+        if choose_every < 1:
+            raise ValueError(f"choose_every must be at least 1, got {choose_every}")
+        self.recording, self.smoother, self.choose_every = recording, smoother, choose_every
         self.motion = geometry.WallMotion.from_recording(recording)
         self.nodes = recording.grid.nodes()
+        self._choices: dict[int, regularize.Choice | None] = {}
 
-    def choose(self, frames: int = CHOICE_FRAMES) -> None:
-        """Choose noise, smoothness and slip once: the geometric means over some frames (automatic smoothers only)."""
+    def choice(self, frame: int) -> regularize.Choice | None:
+        """What was chosen for a frame: that of the middle frame of its group; None for a smoother with fixed options."""
         if not self.smoother.automatic:
-            return
-        count = self.recording.frames
-        picked = np.unique(np.linspace(0, count - 1, min(frames, count) + 2)[1:-1].round().astype(int))
-        found = [self.fit(int(frame)).choice for frame in picked]
-        known = [one for one in found if one is not None]
-        if known:
-            self.choice = _mean_choice(known)
+            return None
+        group = frame // self.choose_every
+        if group not in self._choices:
+            middle = min(group * self.choose_every + self.choose_every // 2, self.recording.frames - 1)
+            self._choices[group] = self._fit(middle).choice
+        return self._choices[group]
 
-    def fit(
-        self, frame: int, velocity: np.ndarray | None = None, weight: np.ndarray | None = None, *,
-        at_rest: bool = False, uncertainty: bool = False, anew: bool = False,
-    ) -> regularize.SplineField:
-        """The spline of one frame.
-
-        ``velocity`` (D, *shape) and ``weight`` (*shape) replace the frame's own, for instance by an innovation, whose
-        walls are ``at_rest``. ``anew``: choose from this very field, whatever was chosen before.
+    def fit(self, frame: int, *, uncertainty: bool = False) -> regularize.SplineField:
+        """The spline of one frame; ``uncertainty`` keeps what its standard deviation needs.
 
         Raises ValueError where no node has a positive weight.
         """
+        return self._fit(frame, uncertainty=uncertainty, choice=self.choice(frame))
+
+    def fit_increment(
+        self, frame: int, innovation: np.ndarray, weight: np.ndarray, choice: regularize.Choice | None
+    ) -> regularize.SplineField:
+        """The spline of an innovation (D, *shape) with confidences (*shape), whose walls are at rest.
+
+        ``choice``: taken over from an earlier innovation; None chooses from this one.
+        """
+        return self._fit(frame, innovation, weight, at_rest=True, choice=choice)
+
+    def _fit(
+        self, frame: int, velocity: np.ndarray | None = None, weight: np.ndarray | None = None, *,
+        at_rest: bool = False, uncertainty: bool = False, choice: regularize.Choice | None = None,
+    ) -> regularize.SplineField:
         recording, dimension = self.recording, self.recording.dimension
         field = recording.velocity[frame] if velocity is None else velocity
         weight = node_weights(recording, frame) if weight is None else weight
@@ -75,7 +84,7 @@ class FrameSmoother:
         return self.smoother.fit(
             self.nodes[used], samples[used], flat_weight[used],
             wall_rows(recording, self.motion, frame, at_rest=at_rest), divergence_points=self.nodes[mask],
-            uncertainty=uncertainty, choice=None if anew else self.choice,
+            uncertainty=uncertainty, choice=choice,
         )
 
     def on_grid(self, fitted: regularize.SplineField, frame: int) -> np.ndarray:
@@ -86,25 +95,12 @@ class FrameSmoother:
         return out.reshape(grid.dimension, *grid.shape)
 
 
-def _mean_choice(choices: list[regularize.Choice]) -> regularize.Choice:
-    """Geometric means of noise, curvature and slip; a slip that some frames leave free counts where it was chosen."""
-
-    def mean(values: list[float]) -> float:
-        return float(np.exp(np.mean(np.log(np.maximum(values, 1e-12)))))
-
-    noise = tuple(mean([c.noise[k] for c in choices]) for k in range(len(choices[0].noise)))
-    slips = [c.no_slip for c in choices if c.no_slip]
-    return replace(
-        choices[0], noise=noise, curvature=mean([c.curvature for c in choices]), no_slip=mean(slips) if slips else None
-    )
-
-
 def smooth(
     measured: geometry.Recording, smoother: regularize.Smoother | None = None, *, progress: bool = False
 ) -> geometry.Recording:
     """Fit every frame of a measurement by a penalised B-spline (thesis section 3.2).
 
-    Noise and smoothness are chosen once, from a few frames; outliers are judged in every frame.
+    Noise and smoothness are chosen automatically every few frames; outliers are judged in every frame.
 
     Args:
         measured: the measurement. smoother: options; None takes the default preset.
@@ -117,9 +113,7 @@ def smooth(
 
 
 def smooth_frames(frames: FrameSmoother, progress: bool = False) -> geometry.Recording:
-    """``smooth`` with a ``FrameSmoother`` of the caller's, which keeps what was chosen."""
-    if frames.choice is None:
-        frames.choose()
+    """``smooth`` with a ``FrameSmoother`` of the caller's, who can then ask it what was chosen."""
     recording = frames.recording
     bar = tqdm(range(recording.frames), desc="spline", disable=None if progress else True, unit="frame")
     fields = np.stack([frames.on_grid(frames.fit(frame), frame) for frame in bar])
