@@ -44,9 +44,9 @@ def test_z_scores_on_data_simulated_from_the_model():
     blocks = build_system(options, knots, data)
     silent = blocks.blocks[0].with_weight(0.0)
     prior = PreparedSystem(System(knots, 3, [silent, *blocks.blocks[1:]], blocks.damping))
-    z = []
+    z, drawn_from = [], prior.factor()
     for _ in range(6):
-        draw = prior.factor().sample(precision, generator)
+        draw = drawn_from.sample(precision, generator)
         truth = torch.zeros(knots.nodes, 3, dtype=torch.float64)
         truth[prior.ordering.nodes] = draw
         cell, t = knots.locate(points)
