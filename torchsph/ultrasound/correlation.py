@@ -34,6 +34,12 @@ class KernelShape:
         return tuple(2 * (h + s) + 1 for h, s in zip(self.half, self.search, strict=True))
 
 
+def power(samples: Tensor) -> Tensor:
+    """|samples|^2 of complex samples, without the square root that ``abs`` takes (several times faster)."""
+    parts = torch.view_as_real(samples)
+    return torch.addcmul(parts[..., 0].square(), parts[..., 1], parts[..., 1])
+
+
 def gather(volume: Tensor, corner: Tensor, size: tuple[int, int, int]) -> Tensor:
     """Blocks (sz, P, sy, sx, T) of ``volume`` (Z, Y, X, T) whose first nodes are ``corner`` (P, 3), array
     order.
@@ -78,8 +84,8 @@ def correlate(
         kernel = kernel * _ramp_phasors(ramp * apart, shape)
     region = gather(volume, corner + offset - corner.new_tensor(shape.search), shape.region)[..., apart:]
     product = _lag_products(kernel, region, shape)
-    kernel_energy = kernel.abs().square().sum((0, 2, 3, 4))
-    energy = region.abs().square().sum(-1).transpose(0, 1)
+    kernel_energy = power(kernel).sum((0, 2, 3, 4))
+    energy = power(region).sum(-1).transpose(0, 1)
     region_energy = F.avg_pool3d(energy[:, None], shape.size, stride=1)[:, 0] * float(
         torch.tensor(shape.size).prod()
     )

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from .acquisition import Packet
 from .clutter import ClutterFilter, FIRFilter
-from .correlation import KernelShape, correlate, gather
+from .correlation import KernelShape, correlate, gather, power
 from .fields import convolve_axis
 from .peak import Peak, find_peak
 
@@ -66,7 +66,7 @@ class SpeckleTracker:
     min_blood: float | None = -60.0
     min_correlation: float = 0.7
     lone_correlation: float = 0.8
-    tile: int = 128
+    tile: int = 64
 
     def __post_init__(self) -> None:
         for name in ("kernel", "search"):
@@ -184,8 +184,8 @@ def _prepare(packet: Packet, options: SpeckleTracker) -> _Images:
     if len(packet.iq) < 2:
         raise ValueError(f"speckle tracking compares images; the packet has {len(packet.iq)}")
     dimension = packet.grid.dimension
-    finite = torch.isfinite(torch.view_as_real(packet.iq)).all(-1).all(0)
-    clean = torch.where(finite, packet.iq, 0)
+    finite = torch.isfinite(_mean_power(packet.iq))
+    clean = packet.iq if bool(finite.all()) else torch.where(finite, packet.iq, 0)
     filtered = clean if options.clutter is None else options.clutter.apply(clean)
     if len(filtered) < 1 + options.lags[0]:
         raise ValueError(
@@ -207,7 +207,7 @@ def _prepare(packet: Packet, options: SpeckleTracker) -> _Images:
     volume = torch.stack([padded(image) for image in filtered], -1)
     gain = 1.0 if options.clutter is None else options.clutter.noise_gain(len(packet.iq))
     return _Images(
-        volume, padded(clean.abs().square().mean(0)), padded(filtered.abs().square().mean(0)),
+        volume, padded(_mean_power(clean)), padded(_mean_power(filtered)),
         padded(finite.to(volume.real.dtype)), padded(torch.ones_like(clean[0].real)),
         tuple([0] * lead + half), tuple([0] * lead + search), tuple(pad),
         torch.tensor([1.0] * lead + spacing, dtype=volume.real.dtype, device=volume.device),
@@ -215,6 +215,14 @@ def _prepare(packet: Packet, options: SpeckleTracker) -> _Images:
         _turn_gradient(volume, half) if options.follow_shear else None,
         tuple(range(lead, 3)),
     )  # fmt: skip
+
+
+def _mean_power(images: Tensor) -> Tensor:
+    """Mean square (*shape) of images (T, *shape), one at a time to spare memory."""
+    total = power(images[0])
+    for image in images[1:]:
+        total += power(image)
+    return total / len(images)
 
 
 def _turn_gradient(volume: Tensor, half: list[int]) -> Tensor:
@@ -246,7 +254,7 @@ def _track_tile(
 ) -> tuple[Tensor, ...]:
     """The fields of :class:`Estimates` for a tile of nodes (P, 3)."""
     corner = nodes + nodes.new_tensor(images.margin) - nodes.new_tensor(images.half)
-    snr, power, flags = _gates(images, corner, shape, options)
+    snr, share, flags = _gates(images, corner, shape, options)
     still = torch.zeros_like(nodes)
     state = _estimate(images, corner, still, options.lags[0], shape, beam, None, options)
     fine = KernelShape(images.half, tuple(min(s, 1) for s in images.search))
@@ -271,7 +279,7 @@ def _track_tile(
     flags |= _bit(state.correlation < least, Flag.DECORRELATED)
     return (
         velocity, state.correlation, state.peak_ratio, state.curvature[:, active].flip(-1),
-        state.variance[:, active].flip(-1) / interval**2, power, snr, state.lag, flags,
+        state.variance[:, active].flip(-1) / interval**2, share, snr, state.lag, flags,
     )  # fmt: skip
 
 
@@ -291,20 +299,20 @@ def _gates(
     count = inside.sum((1, 2, 3)).clamp_min(1)
     passed = kernel(images.power).sum((1, 2, 3)) / count
     before = kernel(images.raw_power).sum((1, 2, 3)) / count
-    power = 10 * torch.log10(passed / before.clamp_min(torch.finfo(before.dtype).tiny))
+    share = 10 * torch.log10(passed / before.clamp_min(torch.finfo(before.dtype).tiny))
     flags = _bit((finite < inside).any(1).any(1).any(1), Flag.NOT_FINITE)
     for axis in images.active:
         others = [a + 1 for a in range(3) if a != axis]
         flags |= _bit(inside.amax(others).sum(1) < options.min_samples, Flag.SAMPLES)
     weak = passed <= 0
     if options.min_blood is not None:
-        weak |= power < options.min_blood
-    snr = torch.full_like(power, math.nan)
+        weak |= share < options.min_blood
+    snr = torch.full_like(share, math.nan)
     if images.noise:
         snr = 10 * torch.log10(passed / images.noise)
         if options.min_snr is not None:
             weak |= snr < options.min_snr
-    return snr, power, flags | _bit(weak, Flag.WEAK)
+    return snr, share, flags | _bit(weak, Flag.WEAK)
 
 
 @dataclass(frozen=True, eq=False)
