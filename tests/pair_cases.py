@@ -34,6 +34,7 @@ def disordered(
             deviation=0.01 * normal(count),
             pressure=normal(count),
             member=member[order],
+            slope=0.01 * normal(count, dimension),
         ),
         dtype,
     )
@@ -46,7 +47,8 @@ def as_dtype(state: PairState, dtype: torch.dtype) -> PairState:
 
 def changed(state, change):
     """The state, or other dataclass of tensors, with ``change`` applied to every tensor."""
-    return type(state)(**{f.name: change(getattr(state, f.name)) for f in dataclasses.fields(state)})
+    values = {f.name: getattr(state, f.name) for f in dataclasses.fields(state)}
+    return type(state)(**{name: None if value is None else change(value) for name, value in values.items()})
 
 
 def support(name: str, dimension: int, length: float | Tensor = 1.2) -> Support:

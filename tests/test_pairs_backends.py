@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 
 import pytest
@@ -29,6 +30,9 @@ RATES = [
         (None, False, True, False, False, True),
         (None, True, False, False, True, False),
         (None, False, False, False, False, False),
+        (None, False, False, False, False, True, True),
+        ("volume", False, False, False, False, False, True, True, True),
+        (None, False, False, False, True, False, False, False, True),
     ]
 ]
 
@@ -199,7 +203,7 @@ def test_batch_is_bitwise_the_members_alone(fast, dimension, dtype):
     for member in range(4):
         own = state.member == member
         alone = changed(state, lambda t: t[own])  # noqa: B023  (used at once)
-        alone = type(alone)(*[*alone.__dict__.values()][:-1], torch.zeros_like(alone.member))
+        alone = dataclasses.replace(alone, member=torch.zeros_like(alone.member))
         pairs = fast.search(alone.position, alone.member, choice.radius)
         own_rates, own_acceleration = fast.right_hand_side(pairs, alone, choice, terms, forces)
         assert torch.equal(own_rates.divergence, rates.divergence[own])

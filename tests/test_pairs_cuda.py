@@ -69,7 +69,8 @@ class TestTerms:
 
     def test_rates_and_forces(self, fast, dtype, dimension, periodic):
         choice, (state, pairs, wide, wanted) = self.arrange(fast, dtype, dimension, periodic)
-        same(fast.rates(pairs, state, choice, RATES), REFERENCE.rates(wanted, wide, choice, RATES), dtype)
+        for terms in (RATES, RateTerms(None, gradient=True, corrected_diffusion=True, moments=True)):
+            same(fast.rates(pairs, state, choice, terms), REFERENCE.rates(wanted, wide, choice, terms), dtype)
         for terms in (FORCES, MomentumTerms("symmetric", 0.3, None, 0.2), MomentumTerms("difference")):
             got = fast.momentum(pairs, state, choice, terms)
             same(got, REFERENCE.momentum(wanted, wide, choice, terms), dtype)

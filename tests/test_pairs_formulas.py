@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
+import torch
 from pair_cases import disordered, support
 
 from torchsph.pairs import MomentumTerms, RateTerms, ReferenceBackend
@@ -132,3 +135,70 @@ def test_moments_of_an_interpolation(problem):
     close(got.second, d.each(lambda a, b: d.w[a, b] * np.outer(s[a, b], s[a, b])))
     close(got.field, d.each(lambda a, b: d.w[a, b] * d.v[b]))
     close(got.field_first, d.each(lambda a, b: d.w[a, b] * np.outer(s[a, b], d.v[b])))
+
+
+def test_corrections(problem):
+    state, choice, pairs, d = problem
+    terms = RateTerms(None, gradient=True, corrected_diffusion=True, moments=True)
+    got = REFERENCE.rates(pairs, state, choice, terms)
+    v, rho, grad, s, slope = d.volume, d.rho, d.gradient, -d.gap, state.slope.numpy()
+    close(got.gradient, d.each(lambda a, b: v[b] * (rho[b] - rho[a]) * grad[a, b]))
+
+    def spreading(a, b):
+        if a == b:
+            return 0.0
+        rise = rho[b] - rho[a] - 0.5 * (slope[a] + slope[b]) @ s[a, b]
+        return 2 * v[b] * rise * s[a, b] @ grad[a, b] / d.r[a, b] ** 2
+
+    close(got.diffusion, d.each(spreading))
+    close(got.moment_first, d.each(lambda a, b: v[b] * d.w[a, b] * s[a, b]))
+    close(got.moment_second, d.each(lambda a, b: v[b] * d.w[a, b] * np.outer(s[a, b], s[a, b])))
+    close(got.moment_mass, d.each(lambda a, b: d.m[b] * d.w[a, b] * s[a, b]))
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_corrected_diffusion_leaves_a_linear_density_alone(dimension):
+    rise = torch.tensor([0.003, -0.002, 0.001][:dimension], dtype=torch.float64)
+    state = disordered(9, dimension)
+    linear = state.position @ rise
+    state = dataclasses.replace(state, deviation=linear)
+    choice = support("wendland_c2", dimension)
+    pairs = REFERENCE.search(state.position, state.member, choice.radius)
+    sums = REFERENCE.rates(pairs, state, choice, RateTerms(None, renormalisation=True, gradient=True))
+    slope = torch.linalg.solve(sums.renormalisation.transpose(1, 2), sums.gradient)
+    np.testing.assert_allclose(slope.numpy(), np.tile(rise.numpy(), (len(slope), 1)), atol=1e-12)
+    state = dataclasses.replace(state, slope=slope)
+    plain = REFERENCE.rates(pairs, state, choice, RateTerms(None, diffusion=True)).diffusion
+    corrected = REFERENCE.rates(pairs, state, choice, RateTerms(None, corrected_diffusion=True)).diffusion
+    assert float(corrected.abs().max()) < 1e-10 * float(plain.abs().max())
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_moments_reproduce_a_linear_density(dimension):
+    state = disordered(9, dimension)
+    rho = 1.0 + state.position @ torch.tensor([0.02, 0.01, 0.03][:dimension], dtype=torch.float64)
+    state = dataclasses.replace(state, deviation=rho - 1.0, mass=rho * (0.5 + state.mass))
+    choice = support("wendland_c2", dimension)
+    pairs = REFERENCE.search(state.position, state.member, choice.radius)
+    m = REFERENCE.rates(pairs, state, choice, RateTerms(None, shepard=True, moments=True))
+    correction = -torch.linalg.solve(m.moment_second, m.moment_first)
+    share = m.shepard_volume + (correction * m.moment_first).sum(1)
+    density = (m.shepard_mass + (correction * m.moment_mass).sum(1)) / share
+    np.testing.assert_allclose(density.numpy(), rho.numpy(), rtol=1e-11)
+
+
+def test_smoothing_length_of_each_particle_is_symmetrised():
+    state = disordered(6, 3)
+    lengths = torch.linspace(0.9, 1.4, 216, dtype=torch.float64)
+    choice = dataclasses.replace(support("cubic", 3), length=lengths, per_particle=True)
+    pairs = REFERENCE.search(state.position, state.member, choice.radius)
+    force = state.mass[:, None] * REFERENCE.momentum(pairs, state, choice, MomentumTerms("sum", 0.3))
+    assert float(force.sum(0).abs().max()) < 1e-13 * float(force.abs().sum(0).max())
+    both = state.position[:2] * 0 + torch.tensor([[0.0, 0, 0], [1.0, 0, 0]], dtype=torch.float64)
+    two = dataclasses.replace(state, **{k: v[:2] for k, v in vars(state).items()} | {"position": both})
+    choice = dataclasses.replace(choice, length=torch.tensor([1.0, 1.4], dtype=torch.float64))
+    pairs = REFERENCE.search(both, two.member, choice.radius)
+    got = REFERENCE.rates(pairs, two, choice, RateTerms(None, concentration=True)).concentration[0, 0]
+    q = 1.0 / 1.2
+    slope = (-3 * q + 2.25 * q * q) / (np.pi * 1.2**4)
+    np.testing.assert_allclose(float(got), -float(two.volume[1]) * slope, rtol=1e-12)

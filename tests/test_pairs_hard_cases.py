@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import pytest
 import torch
 from pair_cases import as_dtype, assert_close, changed, disordered, support
@@ -119,7 +121,7 @@ class TestArrangements:
         one = disordered(6, dimension, dtype)
         both = changed(one, lambda t: torch.cat([t, t]))
         member = torch.cat([one.member, one.member + 1])
-        both = PairState(*[*both.__dict__.values()][:-1], member)
+        both = dataclasses.replace(both, member=member)
         choice = support("cubic", dimension)
         alone = either.rates(either.search(one.position, one.member, choice.radius), one, choice, RATES)
         batch = either.rates(either.search(both.position, member, choice.radius), both, choice, RATES)
@@ -179,7 +181,7 @@ def test_periodic_lattice_moved_across_its_boundary_changes_nothing(either, dime
     period = torch.full((dimension,), 9.0, dtype=dtype)
     results = []
     for move in (0.0, 4.6, -23.0):
-        moved = PairState(state.position + move, *[*state.__dict__.values()][1:])
+        moved = dataclasses.replace(state, position=state.position + move)
         pairs = either.search(moved.position, moved.member, choice.radius, period=period)
         results.append(either.right_hand_side(pairs, moved, choice, RATES, FORCES))
     for rates, acceleration in results[1:]:
@@ -191,7 +193,7 @@ def test_particle_that_wraps_between_search_and_pass(either):
     state, choice = disordered(9, 3), support("cubic", 3)
     period = torch.full((3,), 9.0, dtype=torch.float64)
     pairs = either.search(state.position, state.member, choice.radius, margin=0.2, period=period)
-    wrapped = PairState(torch.remainder(state.position, 9.0), *[*state.__dict__.values()][1:])
+    wrapped = dataclasses.replace(state, position=torch.remainder(state.position, 9.0))
     wanted = either.rates(pairs, state, choice, RATES)
     assert_close(either.rates(pairs, wrapped, choice, RATES), wanted, torch.float64)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 
 import pytest
@@ -43,7 +44,16 @@ class TestOperators:
         lists = backend("cpu").search(state.position, state.member, 2.4).lists
         terms = plan.CONTINUITY | plan.CONCENTRATION | plan.PRESSURE
         coefficients = torch.tensor([[1.2, 0.0, 0.0, 0.0]], dtype=torch.float64)
-        arrays = (state.position, state.velocity, state.mass, state.deviation, state.pressure, None, None)
+        arrays = (
+            state.position,
+            state.velocity,
+            state.mass,
+            state.deviation,
+            state.pressure,
+            None,
+            None,
+            None,
+        )
         arguments = (
             lists,
             [float("inf")] * 3,
@@ -76,7 +86,7 @@ class TestOperators:
         state = disordered(4, 3)
         lists = backend("cpu").search(state.position, state.member, 2.4).lists
         coefficients = torch.ones((1, 4), dtype=torch.float64)
-        arrays = (state.position, state.velocity, state.mass, state.deviation, None, None, None)
+        arrays = (state.position, state.velocity, state.mass, state.deviation, None, None, None, None)
         terms = plan.SHEPARD | plan.CONTINUITY
         with pytest.raises(NotImplementedError, match="0x101"):
             operators.pair_pass(
@@ -92,7 +102,7 @@ class TestWrongInputs:
     def test_mixed_precision(self):
         state = disordered(4, 3, torch.float32)
         pairs = self.pairs(state)
-        mixed = type(state)(state.position, state.velocity.double(), *[*state.__dict__.values()][2:])
+        mixed = dataclasses.replace(state, velocity=state.velocity.double())
         with pytest.raises(TypeError, match="all arrays in float32 or all in float64"):
             backend("cpu").rates(pairs, mixed, support("cubic", 3), RateTerms())
 

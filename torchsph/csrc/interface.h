@@ -37,10 +37,10 @@ typedef struct {
   const void* home;           /* null: no periodic axis */
   double period[3];
   const double* coefficients; /* (members, 4): smoothing length, artificial, laminar, tensile */
-  const void *position, *velocity, *mass, *deviation, *pressure, *field;
+  const void *position, *velocity, *mass, *deviation, *pressure, *slope, *field;
   const uint8_t* active;
   void *divergence, *diffusion, *concentration, *xsph, *acceleration, *shepard_volume, *shepard_mass, *renormalisation,
-      *laplacian, *diagonal;
+      *laplacian, *diagonal, *gradient, *moment_first, *moment_second, *moment_mass;
 } sph_pass;
 
 typedef struct { /* moments of a first-order moving-least-squares fetch; see interpolation.hpp */

@@ -32,7 +32,8 @@ Shape shape_of(const sph_search& s) {
 constexpr bool compiled(std::uint32_t t) {
   const std::uint32_t rates = t & (continuity | diffusion | concentration | xsph);
   const std::uint32_t forces = t & (pressure | artificial | laminar | tensile);
-  if (t > 255) return t == shepard || t == renormalisation || t == laplacian;
+  if (t > 255) return t == shepard || t == renormalisation || t == laplacian || t == gradient || t == (gradient | renormalisation) ||
+           t == corrected_diffusion || t == moments;
   if ((t & tensile) && !(t & pressure)) return false;
   if (!rates || !forces) return t != 0;
   return sizeof(Real) == 4 && register_bytes > 16 && (t & continuity) && (t & pressure) && !(t & (concentration | tensile));
@@ -48,10 +49,16 @@ template <int D, std::uint32_t T> constexpr Run run_of() {
 template <int D, std::size_t... T> Run find(std::uint32_t terms, std::index_sequence<T...>) {
   static constexpr Run table[] = {run_of<D, T>()...};
   if (terms < sizeof...(T)) return table[terms];
-  return terms == shepard           ? run_of<D, shepard>()
-         : terms == renormalisation ? run_of<D, renormalisation>()
-         : terms == laplacian       ? run_of<D, laplacian>()
-                                    : nullptr;
+  switch (terms) {
+    case shepard: return run_of<D, shepard>();
+    case renormalisation: return run_of<D, renormalisation>();
+    case laplacian: return run_of<D, laplacian>();
+    case gradient: return run_of<D, gradient>();
+    case gradient | renormalisation: return run_of<D, gradient | renormalisation>();
+    case corrected_diffusion: return run_of<D, corrected_diffusion>();
+    case moments: return run_of<D, moments>();
+    default: return nullptr;
+  }
 }
 
 template <int D> int pass(const sph_pass& p) {
@@ -62,10 +69,11 @@ template <int D> int pass(const sph_pass& p) {
   const Lists<Real> lists{p.particles, p.clusters, p.slot, p.owner, p.entries, p.offset, reals(p.home),
                           {p.period[0], p.period[1], p.period[2]}, p.home != nullptr, p.threads};
   const State<Real> state{reals(p.position), reals(p.velocity), reals(p.mass), reals(p.deviation), reals(p.pressure),
-                          reals(p.field), p.active, p.weight, p.form};
+                          reals(p.slope), reals(p.field), p.active, p.weight, p.form};
   const Outputs<Real> outputs{out(p.divergence), out(p.diffusion), out(p.concentration), out(p.xsph), out(p.acceleration),
                               out(p.shepard_volume), out(p.shepard_mass), out(p.renormalisation), out(p.laplacian),
-                              out(p.diagonal)};
+                              out(p.diagonal), out(p.gradient), out(p.moment_first), out(p.moment_second),
+                              out(p.moment_mass)};
   const KernelChoice kernel{p.kernel, p.support, p.sigma};
   pack<Real, D>(layout(D, p.terms), state, lists, rows);
   run(lists, rows, kernel, reinterpret_cast<const Coefficients*>(p.coefficients), outputs);

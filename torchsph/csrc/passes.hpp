@@ -9,7 +9,7 @@ constexpr double singularity = 0.01;  // keeps 1 / r^2 finite, in squared smooth
 
 template <class Real> struct Outputs {  // arrays in the caller's order; null where a sum was not asked for
   Real *divergence, *diffusion, *concentration, *xsph, *acceleration, *shepard_volume, *shepard_mass, *renormalisation,
-      *laplacian, *diagonal;
+      *laplacian, *diagonal, *gradient, *moment_first, *moment_second, *moment_mass;
 };
 
 struct Coefficients {  // of one member
@@ -47,7 +47,8 @@ template <class Real, int D, std::uint32_t T> struct Pass {
 
   struct Sums {
     V divergence{}, diffusion{}, shepard_volume{}, shepard_mass{}, laplacian{}, diagonal{};
-    V concentration[D] = {}, xsph[D] = {}, acceleration[D] = {}, renormalisation[D * D] = {};
+    V concentration[D] = {}, xsph[D] = {}, acceleration[D] = {}, renormalisation[D * D] = {}, gradient[D] = {};
+    V moment_first[D] = {}, moment_second[D * D] = {}, moment_mass[D] = {};
   };
 
   struct Own {  // the particles a
@@ -70,6 +71,24 @@ template <class Real, int D, std::uint32_t T> struct Pass {
 
     if constexpr (has(continuity)) s.divergence -= slope * approach;
     if constexpr (has(diffusion)) s.diffusion += slope * (a.field[at.deviation] - b.field(at.deviation));
+    if constexpr (has(corrected_diffusion)) {
+      V drop = a.field[at.deviation] - b.field(at.deviation), linear{};
+      for (int d = 0; d < D; ++d) linear += (a.field[at.slope + d] + b.field(at.slope + d)) * gap[d];
+      s.diffusion += slope * (drop - Real(0.5) * linear);
+    }
+    if constexpr (has(gradient)) {
+      const V rise = slope * (b.field(at.deviation) - a.field[at.deviation]);
+      for (int d = 0; d < D; ++d) s.gradient[d] += rise * gap[d];
+    }
+    if constexpr (has(moments)) {
+      const V volume = weight * w.value, mass = b.field(at.mass) * w.value;
+      for (int d = 0; d < D; ++d) {
+        const V part = volume * gap[d];
+        s.moment_first[d] -= part;
+        s.moment_mass[d] -= mass * gap[d];
+        for (int e = 0; e < D; ++e) s.moment_second[d * D + e] += part * gap[e];
+      }
+    }
     if constexpr (has(concentration))
       for (int d = 0; d < D; ++d) s.concentration[d] += slope * gap[d];
     if constexpr (has(renormalisation))
@@ -122,7 +141,7 @@ template <class Real, int D, std::uint32_t T> struct Pass {
   static SPH_INLINE void write(const Sums& s, const std::int32_t* slot, const Real* factor, Real per_value, Real per_slope,
                                const Outputs<Real>& o) {
     if constexpr (has(continuity)) put<Real>(s.divergence, per_slope, nullptr, slot, o.divergence, 1);
-    if constexpr (has(diffusion)) put<Real>(s.diffusion, 2 * per_slope, nullptr, slot, o.diffusion, 1);
+    if constexpr (has(diffusion | corrected_diffusion)) put<Real>(s.diffusion, 2 * per_slope, nullptr, slot, o.diffusion, 1);
     if constexpr (has(shepard)) {
       put<Real>(s.shepard_volume, per_value, nullptr, slot, o.shepard_volume, 1);
       put<Real>(s.shepard_mass, per_value, nullptr, slot, o.shepard_mass, 1);
@@ -132,10 +151,17 @@ template <class Real, int D, std::uint32_t T> struct Pass {
       put<Real>(s.diagonal, 2 * per_slope, factor, slot, o.diagonal, 1);
     }
     for (int d = 0; d < D; ++d) {
+      if constexpr (has(gradient)) put<Real>(s.gradient[d], per_slope, nullptr, slot, o.gradient + d, D);
+      if constexpr (has(moments)) {
+        put<Real>(s.moment_first[d], per_value, nullptr, slot, o.moment_first + d, D);
+        put<Real>(s.moment_mass[d], per_value, nullptr, slot, o.moment_mass + d, D);
+      }
       if constexpr (has(concentration)) put<Real>(s.concentration[d], per_slope, nullptr, slot, o.concentration + d, D);
       if constexpr (has(xsph)) put<Real>(s.xsph[d], 2 * per_value, factor, slot, o.xsph + d, D);
       if constexpr (has(pressure | artificial | laminar)) put<Real>(s.acceleration[d], per_slope, factor, slot, o.acceleration + d, D);
     }
+    if constexpr (has(moments))
+      for (int d = 0; d < D * D; ++d) put<Real>(s.moment_second[d], per_value, nullptr, slot, o.moment_second + d, D * D);
     if constexpr (has(renormalisation))
       for (int d = 0; d < D * D; ++d) put<Real>(s.renormalisation[d], per_slope, nullptr, slot, o.renormalisation + d, D * D);
   }

@@ -12,7 +12,8 @@ namespace sph {
 enum Term : std::uint32_t {
   continuity = 1, diffusion = 2, concentration = 4, xsph = 8,
   pressure = 16, artificial = 32, laminar = 64, tensile = 128,
-  shepard = 256, renormalisation = 512, laplacian = 1024
+  shepard = 256, renormalisation = 512, laplacian = 1024,
+  gradient = 2048, corrected_diffusion = 4096, moments = 8192
 };
 
 enum Weight : std::int32_t { by_volume = 0, by_mass = 1 };
@@ -21,7 +22,7 @@ enum PressureForm : std::int32_t { symmetric = 0, sum = 1, switched = 2, differe
 // Where each field stands in a row; -1: not there.
 struct Layout {
   int dimension = 0, velocity = -1, weight = -1, stress = -1, inertia = -1, inverse = -1, deviation = -1, mass = -1,
-      field = -1, fields = 0;
+      field = -1, slope = -1, fields = 0;
   constexpr int stride() const { return (fields + 7) / 8 * 8; }
   constexpr int factor() const { return fields; }  // only the particles a have it
   constexpr int block() const { return (fields + 1) * cluster_size; }
@@ -36,15 +37,16 @@ constexpr Layout layout(int dimension, std::uint32_t terms) {
   if (terms & pressure) l.stress = next++;
   if (terms & (xsph | artificial | laminar)) l.inertia = next++;
   if (terms & laminar) l.inverse = next++;
-  if (terms & diffusion) l.deviation = next++;
-  if (terms & shepard) l.mass = next++;
+  if (terms & (diffusion | gradient | corrected_diffusion)) l.deviation = next++;
+  if (terms & (shepard | moments)) l.mass = next++;
   if (terms & laplacian) l.field = next++;
+  if (terms & corrected_diffusion) { l.slope = next; next += dimension; }
   l.fields = next;
   return l;
 }
 
 template <class Real> struct State {
-  const Real *position, *velocity, *mass, *deviation, *pressure, *field;
+  const Real *position, *velocity, *mass, *deviation, *pressure, *slope, *field;
   const std::uint8_t* active;  // laplacian: null, or whether a particle takes part
   std::int32_t weight, form;
 };
@@ -87,6 +89,8 @@ SPH_INLINE void particle_fields(const Layout& l, const State<Real>& s, const Lis
   if (l.deviation >= 0) out[l.deviation] = s.deviation[i];
   if (l.mass >= 0) out[l.mass] = s.mass[i];
   if (l.field >= 0) out[l.field] = s.field[i];
+  if (l.slope >= 0)
+    for (int d = 0; d < D; ++d) out[l.slope + d] = s.slope[i * D + d];
   if (l.field >= 0) out[l.factor()] = weight == 0 ? Real(0) : Real(1);  // an inactive particle takes no sum either
   else out[l.factor()] = s.weight == by_volume ? 1 / density : Real(1);
 }

@@ -119,6 +119,7 @@ class CpuBackend(PlannedBackend):
             plan.coefficients(support, request.momentum, members),
             *(t.contiguous() for t in (state.position, state.velocity, state.mass, state.deviation)),
             state.pressure.contiguous() if request.terms & plan.PRESSURE else None,
+            state.slope.contiguous() if request.terms & plan.CORRECTED_DIFFUSION else None,
             None if field is None else field.contiguous(),
             None if active is None else active.contiguous(),
         )

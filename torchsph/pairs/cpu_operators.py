@@ -99,6 +99,7 @@ def pair_pass(
     mass: Tensor,
     deviation: Tensor,
     pressure: Tensor | None,
+    slope: Tensor | None,
     field: Tensor | None,
     active: Tensor | None,
 ) -> list[Tensor]:
@@ -138,6 +139,7 @@ def pair_pass(
         mass.data_ptr(),
         deviation.data_ptr(),
         _address(pressure),
+        _address(slope),
         _address(field),
         _address(active),
     )
@@ -160,6 +162,7 @@ def _(
     mass: Tensor,
     deviation: Tensor,
     pressure: Tensor | None,
+    slope: Tensor | None,
     field: Tensor | None,
     active: Tensor | None,
 ) -> list[Tensor]:

@@ -2,6 +2,11 @@
 
 Search and packing are torch operations on the device; only the pair loop is a Triton kernel.  With
 ``TRITON_INTERPRET=1`` set before triton is imported the same code runs on CPU tensors, slowly, for tests.
+
+Estimate for 3-D, h = 1.2 spacings, continuity, pressure, artificial viscosity and XSPH in float32: a lane meets
+373 candidates (27 cells of 2.4 spacings) for 58 neighbours and spends 57 flop on each, 21 kflop a particle; it
+reads 48 bytes of its own fields and 76 of runs and writes 28, and 40 bytes per candidate, 15 kB a particle, come
+from caches.
 """
 
 from __future__ import annotations
@@ -136,7 +141,7 @@ class CudaBackend(PlannedBackend):
         raw = packed.new_empty((width, pairs.count))
         terms = {name: bool(request.terms & getattr(plan, name)) for name in _TERMS}
         jumps = plan.CONTINUITY | plan.XSPH | plan.ARTIFICIAL | plan.LAMINAR
-        period = [*pairs.period, float("inf")][:3]
+        periods = packed.new_tensor([*pairs.period, float("inf")][:3])
         self._kernel[(triton_blocks(pairs.count, self._block),)](
             packed,
             own_stress,
@@ -145,7 +150,7 @@ class CudaBackend(PlannedBackend):
             pairs.member,
             pairs.start,
             pairs.stop,
-            *period,
+            periods,
             reach,
             pairs.count,
             D=state.position.shape[1],
@@ -167,16 +172,16 @@ def triton_blocks(count: int, block: int) -> int:
 
 
 _TERMS = (
-    "CONTINUITY", "DIFFUSION", "CONCENTRATION", "XSPH", "PRESSURE", "ARTIFICIAL", "LAMINAR", "TENSILE", "SHEPARD",
-    "RENORMALISATION", "LAPLACIAN",
+    "CONTINUITY", "DIFFUSION", "CONCENTRATION", "XSPH", "PRESSURE", "ARTIFICIAL", "LAMINAR", "TENSILE",
+    "SHEPARD", "RENORMALISATION", "LAPLACIAN", "GRADIENT", "CORRECTED_DIFFUSION", "MOMENTS",
 )  # fmt: skip
-_ROWS = ("WEIGHT", "STRESS", "INERTIA", "INVERSE", "DEVIATION", "MASS", "FIELD")
+_ROWS = ("WEIGHT", "STRESS", "INERTIA", "INVERSE", "DEVIATION", "MASS", "FIELD", "SLOPE")
 
 
 def _pack(
     pairs: CellRuns, state: PairState, request: plan.Pass, field: Tensor | None, active: Tensor | None
 ) -> tuple[Tensor, dict[str, int]]:
-    """(F, N) fields in cell order, and the row of each; position first, velocity next, the factor of a last."""
+    """(F, N) fields in cell order, and the row of each: position, velocity, ..., the factor of a."""
     density = 1.0 + state.deviation
     by_volume = request.weight == plan.BY_VOLUME
     weight = state.mass / density if by_volume else state.mass
@@ -189,10 +194,14 @@ def _pack(
     quantities["INERTIA"] = 1.0 / density if by_volume else density
     quantities["INVERSE"] = density if by_volume else 1.0 / density
     quantities["DEVIATION"] = state.deviation
-    if request.terms & plan.SHEPARD:
+    if request.terms & (plan.SHEPARD | plan.MOMENTS):
         quantities["MASS"] = state.mass
     if field is not None:
         quantities["FIELD"] = field
+    if request.terms & plan.CORRECTED_DIFFUSION:
+        quantities |= {
+            name: part for name, part in zip(("SLOPE", "SLOPE_Y", "SLOPE_Z"), state.slope.T, strict=False)
+        }
     quantities["FACTOR"] = 1.0 / density if by_volume else torch.ones_like(density)
     if field is not None:
         quantities["FACTOR"] = torch.ones_like(density) if active is None else active.to(density.dtype)
@@ -237,6 +246,9 @@ def _scaled(
         "acceleration": slope * factor,
         "shepard_volume": value,
         "shepard_mass": value,
+        "moment_first": value,
+        "moment_second": value,
+        "moment_mass": value,
         "laplacian": 2.0 * slope * factor,
         "diagonal": 2.0 * slope * factor,
     }

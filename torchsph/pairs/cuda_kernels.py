@@ -62,13 +62,40 @@ def nearest(gap, period, PERIODIC: tl.constexpr):
 
 
 @triton.jit
+def store_vector(out, row, count, a, live, x, y, z, D: tl.constexpr):
+    """Write the components into rows of ``out``; the next free row."""
+    tl.store(out + row * count + a, x, mask=live)
+    tl.store(out + (row + 1) * count + a, y, mask=live)
+    if D == 3:
+        tl.store(out + (row + 2) * count + a, z, mask=live)
+    return row + D
+
+
+@triton.jit
+def store_matrix(out, row, count, a, live, xx, xy, xz, yy, yz, zz, D: tl.constexpr):
+    """Write a symmetric matrix, row by row; the next free row of ``out``."""
+    tl.store(out + row * count + a, xx, mask=live)
+    tl.store(out + (row + 1) * count + a, xy, mask=live)
+    tl.store(out + (row + D) * count + a, xy, mask=live)
+    tl.store(out + (row + D + 1) * count + a, yy, mask=live)
+    if D == 3:
+        tl.store(out + (row + 2) * count + a, xz, mask=live)
+        tl.store(out + (row + 5) * count + a, yz, mask=live)
+        tl.store(out + (row + 6) * count + a, xz, mask=live)
+        tl.store(out + (row + 7) * count + a, yz, mask=live)
+        tl.store(out + (row + 8) * count + a, zz, mask=live)
+    return row + D * D
+
+
+@triton.jit
 def pair_sums(
-    fields, own_stress, out, coefficients, member, start, stop, px, py, pz, support, count,
+    fields, own_stress, out, coefficients, member, start, stop, periods, support, count,
     D: tl.constexpr, KERNEL: tl.constexpr, RANGES: tl.constexpr, PERIODIC: tl.constexpr, BLOCK: tl.constexpr,
     JUMPS: tl.constexpr, APPROACH: tl.constexpr, CONTINUITY: tl.constexpr, DIFFUSION: tl.constexpr,
     CONCENTRATION: tl.constexpr, XSPH: tl.constexpr, PRESSURE: tl.constexpr, ARTIFICIAL: tl.constexpr,
     LAMINAR: tl.constexpr, TENSILE: tl.constexpr, SHEPARD: tl.constexpr, RENORMALISATION: tl.constexpr,
-    LAPLACIAN: tl.constexpr, WEIGHT: tl.constexpr, STRESS: tl.constexpr, INERTIA: tl.constexpr,
+    LAPLACIAN: tl.constexpr, GRADIENT: tl.constexpr, CORRECTED_DIFFUSION: tl.constexpr, MOMENTS: tl.constexpr,
+    SLOPE: tl.constexpr, WEIGHT: tl.constexpr, STRESS: tl.constexpr, INERTIA: tl.constexpr,
     INVERSE: tl.constexpr, DEVIATION: tl.constexpr, MASS: tl.constexpr, FIELD: tl.constexpr,
 ):  # fmt: skip
     """Sums of BLOCK particles; ``fields`` (F, count) and ``out`` (O, count) hold one quantity per row.
@@ -84,6 +111,9 @@ def pair_sums(
     inverse_length = tl.load(coefficients + 5 * own)
     epsilon = tl.load(coefficients + 5 * own + 1)
     zero = 0.0 * xa
+    px = tl.load(periods)  # by address: a scalar argument would be rounded to float32
+    py = tl.load(periods + 1)
+    pz = tl.load(periods + 2)
     za = zero
     ua = zero
     va = zero
@@ -105,8 +135,16 @@ def pair_sums(
     if LAMINAR:
         inverse = tl.load(fields + INVERSE * count + a, mask=live, other=1.0)
     deviation = zero
-    if DIFFUSION:
+    if DIFFUSION or CORRECTED_DIFFUSION or GRADIENT:
         deviation = tl.load(fields + DEVIATION * count + a, mask=live, other=0.0)
+    slope_x = zero
+    slope_y = zero
+    slope_z = zero
+    if CORRECTED_DIFFUSION:
+        slope_x = tl.load(fields + SLOPE * count + a, mask=live, other=0.0)
+        slope_y = tl.load(fields + (SLOPE + 1) * count + a, mask=live, other=0.0)
+        if D == 3:
+            slope_z = tl.load(fields + (SLOPE + 2) * count + a, mask=live, other=0.0)
     field = zero
     if LAPLACIAN:
         field = tl.load(fields + FIELD * count + a, mask=live, other=0.0)
@@ -133,6 +171,9 @@ def pair_sums(
     nyy = zero
     nyz = zero
     nzz = zero
+    mass_x = zero
+    mass_y = zero
+    mass_z = zero
     total = zero
     diagonal = zero
 
@@ -168,6 +209,33 @@ def pair_sums(
                 divergence -= slope * approach
             if DIFFUSION:
                 spread += slope * (deviation - tl.load(fields + DEVIATION * count + b, mask=here, other=0.0))
+            if CORRECTED_DIFFUSION:
+                linear = x * (slope_x + tl.load(fields + SLOPE * count + b, mask=here, other=0.0))
+                linear += y * (slope_y + tl.load(fields + (SLOPE + 1) * count + b, mask=here, other=0.0))
+                if D == 3:
+                    linear += z * (slope_z + tl.load(fields + (SLOPE + 2) * count + b, mask=here, other=0.0))
+                drop = deviation - tl.load(fields + DEVIATION * count + b, mask=here, other=0.0)
+                spread += slope * (drop - 0.5 * linear)
+            if GRADIENT:
+                rise = tl.load(fields + DEVIATION * count + b, mask=here, other=0.0) - deviation
+                drift_x += slope * rise * x
+                drift_y += slope * rise * y
+                drift_z += slope * rise * z
+            if MOMENTS:
+                volume = weight * value
+                mass = tl.load(fields + MASS * count + b, mask=here, other=0.0) * value
+                first_x -= volume * x
+                first_y -= volume * y
+                first_z -= volume * z
+                mass_x -= mass * x
+                mass_y -= mass * y
+                mass_z -= mass * z
+                nxx += volume * x * x
+                nxy += volume * x * y
+                nxz += volume * x * z
+                nyy += volume * y * y
+                nyz += volume * y * z
+                nzz += volume * z * z
             if CONCENTRATION:
                 first_x += slope * x
                 first_y += slope * y
@@ -223,39 +291,27 @@ def pair_sums(
         tl.store(out + row * count + a, spread, mask=live)
         row += 1
     if CONCENTRATION:
-        tl.store(out + row * count + a, first_x, mask=live)
-        tl.store(out + (row + 1) * count + a, first_y, mask=live)
-        if D == 3:
-            tl.store(out + (row + 2) * count + a, first_z, mask=live)
-        row += D
+        row = store_vector(out, row, count, a, live, first_x, first_y, first_z, D)
     if XSPH:
-        tl.store(out + row * count + a, drift_x, mask=live)
-        tl.store(out + (row + 1) * count + a, drift_y, mask=live)
-        if D == 3:
-            tl.store(out + (row + 2) * count + a, drift_z, mask=live)
-        row += D
+        row = store_vector(out, row, count, a, live, drift_x, drift_y, drift_z, D)
     if PRESSURE or ARTIFICIAL or LAMINAR:
-        tl.store(out + row * count + a, force_x, mask=live)
-        tl.store(out + (row + 1) * count + a, force_y, mask=live)
-        if D == 3:
-            tl.store(out + (row + 2) * count + a, force_z, mask=live)
-        row += D
+        row = store_vector(out, row, count, a, live, force_x, force_y, force_z, D)
     if SHEPARD:
         tl.store(out + row * count + a, shepard_volume, mask=live)
         tl.store(out + (row + 1) * count + a, shepard_mass, mask=live)
         row += 2
     if RENORMALISATION:
-        tl.store(out + row * count + a, nxx, mask=live)
-        tl.store(out + (row + 1) * count + a, nxy, mask=live)
-        tl.store(out + (row + D) * count + a, nxy, mask=live)
-        tl.store(out + (row + D + 1) * count + a, nyy, mask=live)
-        if D == 3:
-            tl.store(out + (row + 2) * count + a, nxz, mask=live)
-            tl.store(out + (row + 5) * count + a, nyz, mask=live)
-            tl.store(out + (row + 6) * count + a, nxz, mask=live)
-            tl.store(out + (row + 7) * count + a, nyz, mask=live)
-            tl.store(out + (row + 8) * count + a, nzz, mask=live)
-        row += D * D
+        row = store_matrix(out, row, count, a, live, nxx, nxy, nxz, nyy, nyz, nzz, D)
     if LAPLACIAN:
         tl.store(out + row * count + a, total, mask=live)
         tl.store(out + (row + 1) * count + a, diagonal, mask=live)
+        row += 2
+    if GRADIENT:
+        row = store_vector(out, row, count, a, live, drift_x, drift_y, drift_z, D)
+    if CORRECTED_DIFFUSION:
+        tl.store(out + row * count + a, spread, mask=live)
+        row += 1
+    if MOMENTS:
+        row = store_vector(out, row, count, a, live, first_x, first_y, first_z, D)
+        row = store_matrix(out, row, count, a, live, nxx, nxy, nxz, nyy, nyz, nzz, D)
+        row = store_vector(out, row, count, a, live, mass_x, mass_y, mass_z, D)

@@ -24,15 +24,21 @@ PRESSURE_FORMS = ("symmetric", "sum", "switched", "difference")
 
 @dataclass(frozen=True)
 class Support:
-    """Kernel and smoothing length of a pass; ``length`` is a float or a tensor (members,)."""
+    """Kernel and smoothing length of a pass.
+
+    Attributes:
+        length: a float, a tensor (members,), or with ``per_particle`` a tensor (N,): then a pair has the
+            mean of its two lengths (Benz 1990; the reference only).
+    """
 
     kernel: SmoothingKernel
     length: float | Tensor
     dimension: int
+    per_particle: bool = False
 
     @property
     def radius(self) -> float:
-        """Largest support radius over the members."""
+        """Largest support radius over members or particles."""
         longest = float(self.length.max()) if isinstance(self.length, Tensor) else self.length
         return self.kernel.support * longest
 
@@ -48,6 +54,7 @@ class PairState:
         deviation: (N,), (rho - rho0) / rho0.
         pressure: (N,), p / rho0; only the momentum pass reads it.
         member: (N,) int64.
+        slope: (N, D), renormalised gradient of the deviation; only the corrected diffusion reads it.
     """
 
     position: Tensor
@@ -56,6 +63,7 @@ class PairState:
     deviation: Tensor
     pressure: Tensor
     member: Tensor
+    slope: Tensor | None = None
 
     @property
     def volume(self) -> Tensor:
@@ -76,6 +84,13 @@ class RateTerms:
         xsph: sum_b 2 m_b / (rho_a + rho_b) (v_b - v_a) W (errata to 2.33).
         shepard: sums of V_b W and of m_b W over b, with b = a (2.20).
         renormalisation: sum_b V_b (x_b - x_a) (x) grad W (Bonet & Lok 1999 eq. 45), (N, D, D).
+        gradient: sum_b V_b (d_b - d_a) grad W, (N, D); the inverse of the renormalisation makes it exact for
+            linear d.
+        corrected_diffusion: as ``diffusion`` with (d_b - d_a) - (slope_a + slope_b) . (x_b - x_a) / 2 for
+            d_b - d_a (Antuono et al. 2010 eq. 4), so that a hydrostatic density is left alone; it fills
+            ``Rates.diffusion`` and reads ``PairState.slope``.
+        moments: sums of V_b W s, V_b W s (x) s and m_b W s with s = x_b - x_a, which with ``shepard`` give
+            the moving-least-squares density (Dilts 1999; Colagrossi & Landrini 2003 eq. 12-14).
     """
 
     continuity: str | None = "volume"
@@ -84,8 +99,15 @@ class RateTerms:
     xsph: bool = False
     shepard: bool = False
     renormalisation: bool = False
+    gradient: bool = False
+    corrected_diffusion: bool = False
+    moments: bool = False
 
     def __post_init__(self) -> None:
+        if self.diffusion and self.corrected_diffusion:
+            raise ValueError(
+                "diffusion and corrected_diffusion are two forms of one term: ask for one of them"
+            )
         if self.continuity is not None and self.continuity not in CONTINUITY_FORMS:
             raise ValueError(f"continuity must be one of {CONTINUITY_FORMS} or None, got '{self.continuity}'")
 
@@ -101,6 +123,10 @@ class Rates:
     shepard_volume: Tensor | None = None
     shepard_mass: Tensor | None = None
     renormalisation: Tensor | None = None
+    gradient: Tensor | None = None
+    moment_first: Tensor | None = None
+    moment_second: Tensor | None = None
+    moment_mass: Tensor | None = None
 
 
 @dataclass(frozen=True)

@@ -68,6 +68,7 @@ class PassArguments(ctypes.Structure):
         ("mass", _pointer),
         ("deviation", _pointer),
         ("pressure", _pointer),
+        ("slope", _pointer),
         ("field", _pointer),
         ("active", _pointer),
         ("divergence", _pointer),
@@ -80,6 +81,10 @@ class PassArguments(ctypes.Structure):
         ("renormalisation", _pointer),
         ("laplacian", _pointer),
         ("diagonal", _pointer),
+        ("gradient", _pointer),
+        ("moment_first", _pointer),
+        ("moment_second", _pointer),
+        ("moment_mass", _pointer),
     ]
 
 

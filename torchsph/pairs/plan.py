@@ -18,6 +18,7 @@ from .interface import PRESSURE_FORMS, MomentumTerms, RateTerms, Support
 CONTINUITY, DIFFUSION, CONCENTRATION, XSPH = 1, 2, 4, 8
 PRESSURE, ARTIFICIAL, LAMINAR, TENSILE = 16, 32, 64, 128
 SHEPARD, RENORMALISATION, LAPLACIAN = 256, 512, 1024
+GRADIENT, CORRECTED_DIFFUSION, MOMENTS = 2048, 4096, 8192
 BY_VOLUME, BY_MASS = 0, 1
 # the order of sph::Kernel in csrc/smoothing.hpp
 KERNEL_ORDER = ("wendland_c2", "wendland_c4", "wendland_c6", "cubic", "quintic", "gaussian", "spiky")
@@ -35,6 +36,11 @@ _OUTPUTS: tuple[tuple[int, str, int], ...] = (
     (RENORMALISATION, "renormalisation", _MATRIX),
     (LAPLACIAN, "laplacian", _SCALAR),
     (LAPLACIAN, "diagonal", _SCALAR),
+    (GRADIENT, "gradient", _VECTOR),
+    (CORRECTED_DIFFUSION, "diffusion", _SCALAR),
+    (MOMENTS, "moment_first", _VECTOR),
+    (MOMENTS, "moment_second", _MATRIX),
+    (MOMENTS, "moment_mass", _VECTOR),
 )
 
 
@@ -105,7 +111,14 @@ def shared_passes(rates: RateTerms, momentum: MomentumTerms) -> list[Pass] | Non
 
 
 def _separate_passes(terms: RateTerms) -> list[Pass]:
-    wanted = ((terms.shepard, SHEPARD), (terms.renormalisation, RENORMALISATION))
+    wanted = (
+        (terms.shepard, SHEPARD),
+        (terms.renormalisation and not terms.gradient, RENORMALISATION),
+        (terms.gradient and not terms.renormalisation, GRADIENT),
+        (terms.gradient and terms.renormalisation, GRADIENT | RENORMALISATION),
+        (terms.corrected_diffusion, CORRECTED_DIFFUSION),
+        (terms.moments, MOMENTS),
+    )
     return [Pass(flag, BY_VOLUME) for asked, flag in wanted if asked]
 
 
@@ -139,6 +152,10 @@ def kernel_choice(support: Support, backend: str) -> tuple[int, list[float]]:
     Raises:
         ValueError: the kernel is not one of ``torchsph.smoothing``.
     """
+    if support.per_particle:
+        raise ValueError(
+            f"the {backend} backend has one smoothing length per member; use backend='reference'"
+        )
     kernel = support.kernel
     family = "gaussian" if kernel.name.startswith("gaussian") else kernel.name
     known = family == "gaussian" or KERNELS.get(kernel.name) is kernel

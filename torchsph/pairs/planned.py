@@ -69,6 +69,10 @@ class PlannedBackend(Backend):
         for request in requests:
             if request.terms & plan.PRESSURE:
                 self.check(state.position, state.pressure)
+            if request.terms & plan.CORRECTED_DIFFUSION:
+                if state.slope is None:
+                    raise ValueError("corrected_diffusion needs the state's slope (PairState.slope)")
+                self.check(state.position, state.slope)
             outputs = self._evaluate(pairs, state, support, request)
             sums.update(zip(request.outputs, outputs, strict=True))
         return sums

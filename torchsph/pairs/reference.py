@@ -68,8 +68,11 @@ class ReferenceBackend(Backend):
             wa, wb = (va, vb) if terms.continuity == "volume" else geometry.ends(state.mass)
             flux = (jump * geometry.gradient).sum(1)
             out["divergence"] = geometry.collect(wb * flux, wa * flux)
-        if terms.diffusion:
-            spread = -2.0 * geometry.factor * geometry.second_minus_first(state.deviation)
+        if terms.diffusion or terms.corrected_diffusion:
+            rise = geometry.second_minus_first(state.deviation)
+            if terms.corrected_diffusion:
+                rise = rise + _linear_part(geometry, state)
+            spread = -2.0 * geometry.factor * rise
             out["diffusion"] = geometry.collect(vb * spread, -va * spread)
         if terms.concentration:
             out["concentration"] = geometry.collect(
@@ -80,18 +83,16 @@ class ReferenceBackend(Backend):
             da, db = geometry.ends(state.deviation)
             pull = (geometry.value / (1.0 + 0.5 * (da + db)))[:, None] * jump
             out["xsph"] = geometry.collect(mb[:, None] * pull, -ma[:, None] * pull)
-        if terms.shepard:
-            centre = geometry.value_at_zero()
-            ma, mb = geometry.ends(state.mass)
-            out["shepard_volume"] = (
-                geometry.collect(vb * geometry.value, va * geometry.value) + volume * centre
-            )
-            out["shepard_mass"] = (
-                geometry.collect(mb * geometry.value, ma * geometry.value) + state.mass * centre
-            )
+        if terms.gradient:
+            rise = geometry.second_minus_first(state.deviation)[:, None] * geometry.gradient
+            out["gradient"] = geometry.collect(vb[:, None] * rise, va[:, None] * rise)
         if terms.renormalisation:
             outer = -geometry.gap[:, :, None] * geometry.gradient[:, None, :]
             out["renormalisation"] = geometry.collect(vb[:, None, None] * outer, va[:, None, None] * outer)
+        if terms.shepard:
+            out |= _shepard_sums(geometry, state)
+        if terms.moments:
+            out |= _moment_sums(geometry, state)
         return Rates(**out)
 
     def momentum(self, pairs: PairList, state: PairState, support: Support, terms: MomentumTerms) -> Tensor:
@@ -141,7 +142,10 @@ class ReferenceBackend(Backend):
         check_search(torch.cat((position, query)), support.radius, period)
         row, particle = cross_pairs(query, query_member, position, member, support.radius, period)
         offset = nearest_image(position.index_select(0, particle) - query.index_select(0, row), period)
-        length = per_particle(support.length, query_member.index_select(0, row))
+        if support.per_particle:
+            length = support.length.index_select(0, particle)
+        else:
+            length = per_particle(support.length, query_member.index_select(0, row))
         weight = support.kernel.value(offset.norm(dim=1), length, support.dimension)
         first = weight[:, None] * offset
         carried = fields.index_select(0, particle)
@@ -181,6 +185,35 @@ def _central_forces(
     return shared
 
 
+def _linear_part(geometry: _Geometry, state: PairState) -> Tensor:
+    """-(slope_a + slope_b) . (x_b - x_a) / 2, what the diffusion of Antuono et al. 2010 leaves alone (P,)."""
+    if state.slope is None:
+        raise ValueError(
+            "corrected_diffusion needs the state's slope: the renormalised gradient of the deviation"
+        )
+    slope_a, slope_b = geometry.ends(state.slope)
+    return 0.5 * ((slope_a + slope_b) * geometry.gap).sum(1)
+
+
+def _shepard_sums(geometry: _Geometry, state: PairState) -> dict[str, Tensor]:
+    centre = geometry.value_at_zero()
+    (va, vb), (ma, mb) = geometry.ends(state.volume), geometry.ends(state.mass)
+    volume = geometry.collect(vb * geometry.value, va * geometry.value)
+    mass = geometry.collect(mb * geometry.value, ma * geometry.value)
+    return {"shepard_volume": volume + state.volume * centre, "shepard_mass": mass + state.mass * centre}
+
+
+def _moment_sums(geometry: _Geometry, state: PairState) -> dict[str, Tensor]:
+    first = -geometry.value[:, None] * geometry.gap  # b - a; the other way round for b
+    second = geometry.value[:, None, None] * geometry.gap[:, :, None] * geometry.gap[:, None, :]
+    (va, vb), (ma, mb) = geometry.ends(state.volume), geometry.ends(state.mass)
+    return {
+        "moment_first": geometry.collect(vb[:, None] * first, -va[:, None] * first),
+        "moment_second": geometry.collect(vb[:, None, None] * second, va[:, None, None] * second),
+        "moment_mass": geometry.collect(mb[:, None] * first, -ma[:, None] * first),
+    }
+
+
 class _Geometry:
     """Distances and kernel values of the pairs, evaluated where a term first asks for them."""
 
@@ -192,8 +225,12 @@ class _Geometry:
         self.square = (self.gap * self.gap).sum(1)
         # the square root has no derivative at zero; the shift is far below the rounding of any real distance
         self.distance = torch.sqrt(self.square + torch.finfo(self.square.dtype).tiny)
-        self._length = per_particle(support.length, state.member)
-        self.length = self.first_of(self._length)
+        if support.per_particle:
+            self._length = support.length
+            self.length = 0.5 * sum(self.ends(support.length))
+        else:
+            self._length = per_particle(support.length, state.member)
+            self.length = self.first_of(self._length)
         self.factor = support.kernel.gradient_factor(self.distance, self.length, support.dimension)
         self.gradient = self.factor[:, None] * self.gap
         self._value: Tensor | None = None
