@@ -129,7 +129,7 @@ class LikelihoodSearch:
     def run(self, noise: float, curvature: float, no_slip: float | None, rounds: int) -> Choice:
         """Search from a first guess: noise in m/s, curvature in m, no_slip as in the Smoother's options."""
         fit = torch.full((self.components,), noise**-2, dtype=torch.float64)
-        scale = self._scale(fit)
+        scale = self.scale(fit)
         rough, slip = scale * curvature**4, 0.0
         if self.slip is not None and no_slip is not None:
             slip = scale * no_slip**2
@@ -139,30 +139,30 @@ class LikelihoodSearch:
             old = (fit, rough, slip)
             fit, rough, slip = self._round(fit, rough, slip)
             settled = self._settled(old, (fit, rough, slip))
-        scale = self._scale(fit)
+        scale = self.scale(fit)
         chosen = (slip / scale) ** 0.5 if self.slip is not None and no_slip is not None else None
         noise_each = tuple((fit**-0.5).tolist())
         return Choice(noise_each, (rough / scale) ** 0.25, chosen, self.factor, count, settled)
 
     def _round(self, fit: torch.Tensor, rough: float, slip: float) -> tuple[torch.Tensor, float, float]:
-        prior, right = self._prior(fit, rough, slip)
+        prior, right = self.prior(fit, rough, slip)
         posterior = Factor(prior + widen(self.data.band, fit), self.ordering)
         prior = Factor(prior, self.ordering)
         x = posterior.solve(right + fit * self.data.right)
         new_fit = self._noise(x, fit, posterior)
-        low, high = (self._scale(fit) * (factor * self.step) ** 4 for factor in (SHARPEST, 1 / SHARPEST))
+        low, high = (self.scale(fit) * (factor * self.step) ** 4 for factor in (SHARPEST, 1 / SHARPEST))
         rough *= self._step(prior, posterior, self.rough_probes, self.curvature.energy(x))
         rough = min(max(rough, low), high)
         if slip > 0:
             slip *= self._step(prior, posterior, self.slip_probes, self.slip.energy(x))
-            slip = min(slip, self._scale(fit) / SHARPEST**2)
+            slip = min(slip, self.scale(fit) / SHARPEST**2)
         if self.robust is not None:
-            self._reweigh(x)
+            self.reweigh(x)
         return new_fit, rough, slip
 
-    def _prior(self, fit: torch.Tensor, rough: float, slip: float) -> tuple[torch.Tensor, torch.Tensor]:
+    def prior(self, fit: torch.Tensor, rough: float, slip: float) -> tuple[torch.Tensor, torch.Tensor]:
         """Band and right-hand side of all penalties."""
-        scale, one = self._scale(fit), torch.ones(self.components, dtype=torch.float64)
+        scale, one = self.scale(fit), torch.ones(self.components, dtype=torch.float64)
         prior = scale * self.fixed + widen(self.curvature.band, rough * one)
         right = scale * self.fixed_right
         if slip > 0:
@@ -191,11 +191,12 @@ class LikelihoodSearch:
         trace = float((probes * gained).sum()) / PROBES
         return min((max(trace, 1e-30) / max(energy, 1e-30)) ** RELAXATION, MOST_PER_ROUND)
 
-    def _scale(self, fit: torch.Tensor) -> float:
+    def scale(self, fit: torch.Tensor) -> float:
         """Precision of the whole data set: what turns the Smoother's cost into a log-likelihood."""
         return float(fit.mean() * (self.groups.weight.double().square() * self.factor).sum())
 
-    def _reweigh(self, x: torch.Tensor) -> None:
+    def reweigh(self, x: torch.Tensor) -> None:
+        """Judge the samples anew by their distance from the fit with coefficients x (active, C)."""
         fitted = self.fit.matvec(self.ordering.expand(x)).view(-1, self.components)
         residual = self.groups.velocity - fitted / self.groups.weight[:, None]
         self._weigh(robust_weight(residual, self.robust))

@@ -4,6 +4,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from .gcv import cross_validate
 from .knots import Knots
 from .likelihood import Choice, Groups, LikelihoodSearch
 from .operators import CellRows, VectorRows
@@ -41,4 +42,6 @@ def choose(options: "Smoother", knots: Knots, data: FitData) -> Choice | None:
     )
     search = LikelihoodSearch(coarse, groups, options.robust)
     with torch.no_grad():
+        if options.automatic == "gcv":
+            return cross_validate(search, options.no_slip, options.rounds)
         return search.run(guess, options.curvature, options.no_slip, options.rounds)

@@ -39,7 +39,7 @@ from .walls import WallRows
 SOLVERS = ("auto", "direct", "lsqr", "lsmr", "pcg")
 NEIGHBOUR_ITERATIONS = 25  # about what a factorisation costs
 SCALINGS = ("density", "thesis")
-AUTOMATIC = (None, "likelihood")
+AUTOMATIC = (None, "likelihood", "gcv")
 
 
 @dataclass(frozen=True)
@@ -51,9 +51,10 @@ class Smoother:
     with a time column; ``time_curvature`` (s) adds time_curvature^4 <|d^2 v / dt^2|^2> to the cost and keeps
     its ratio to curvature where that is chosen automatically. ``power``: samples' rows are multiplied by
     weight ** power. ``automatic="likelihood"`` chooses curvature, no_slip and the noise of each velocity
-    component from the data (see ``likelihood``); the values given here are then the first guess, and are
-    kept where fewer than 30 samples, or samples of no flow, leave nothing to choose from (``field.choice``
-    is None there). ``robust``: "tukey" or "huber" reweighting of outliers, found together with that choice.
+    component from the data (see ``likelihood``), "gcv" curvature alone, believing all samples independent
+    (see ``gcv``); the values given here are then the first guess, and are kept where fewer than 30 samples,
+    or samples of no flow, leave nothing to choose from (``field.choice`` is None there). ``robust``: "tukey"
+    or "huber" reweighting of outliers, found together with that choice.
     ``search_knots``: the choice is made on a grid this many times coarser, in at most ``rounds`` rounds.
     ``solver``: "direct" (what "auto" picks), "lsqr", "lsmr", or "pcg" with a neighbouring frame's factor;
     ``sparse``: the iterative ones store the matrix and its transpose instead of applying rows.
@@ -160,10 +161,11 @@ class Smoother:
         ``box``: lower and upper corner of the knot grid (default: around all points); give the same one for
         all frames of a recording. ``uncertainty``: keep the factor for ``field.std``. ``neighbour``: with
         solver="pcg", an earlier such fit on the same knots, whose factor and coefficients start this one (the
-        first frame, and one too unlike its neighbour, are solved directly). Velocities and weights that
-        require gradients pass them on to the field (options fixed, solver "auto" or "direct"). Samples of
-        zero weight are ignored and may be NaN. Raises InvalidInput for bad input, NotConverged when the
-        solver fails.
+        first frame, and one too unlike its neighbour, are solved directly). ``choice``: noise, curvature and
+        slip of another frame's ``field.choice`` in place of a search; outliers are judged anew. Velocities
+        and weights that require gradients pass them on to the field (options fixed, solver "auto" or
+        "direct"). Samples of zero weight are ignored and may be NaN. Raises InvalidInput for bad input,
+        NotConverged when the solver fails.
         """
         where = (divergence_points, box, self.power)
         data = FitData.checked(points, velocity, weight, wall, *where, beam=beam)
@@ -209,7 +211,7 @@ class Smoother:
 
     def _problem(self, data: FitData) -> Problem:
         knots = knots_for(data, self)
-        choice = choose(self, knots, data) if self.automatic == "likelihood" else None
+        choice = choose(self, knots, data) if self.automatic else None
         if choice is not None:
             return self._with_choice(knots, data, choice)
         return Problem(data, build_system(self.fixed(), knots, data), None)

@@ -85,3 +85,24 @@ def test_std_needs_a_posterior_and_is_masked():
     assert torch.isnan(field.std(points + 1.0)).all() and (field.std(points) >= 0).all()
     with pytest.raises(InvalidInput, match="uncertainty"):
         Smoother(solver="lsqr", divergence=None, **SMALL).fit(points, points, uncertainty=True)
+
+
+def test_cross_validation_finds_the_best_curvature_on_white_noise():
+    generator = torch.Generator().manual_seed(2)
+    points = torch.rand(3000, 2, generator=generator, dtype=torch.float64) * 40e-3
+    x, y = (300 * points).unbind(1)
+    exact = torch.stack([torch.sin(y) + torch.cos(2 * y), torch.sin(2 * x)], dim=1)
+    measured = exact + 0.5 * torch.randn(3000, 2, generator=generator, dtype=torch.float64)
+    options = Smoother(knots=2e-3, automatic="gcv", robust=None, search_knots=1.0)
+    chosen = options.fit(points, measured)
+    assert chosen.choice.noise == pytest.approx((0.5, 0.5), rel=0.05)
+
+    def error(length):
+        return float((options.fixed(curvature=length).fit(points, measured)(points) - exact).norm())
+
+    best = min(error(chosen.choice.curvature * 2.0**k) for k in (-2, -1, -0.5, 0, 0.5, 1, 2))
+    assert error(chosen.choice.curvature) < 1.05 * best
+    measured[:60] += 20.0
+    robust = Smoother(knots=2e-3, automatic="gcv").fit(points, measured)
+    assert float(robust.choice.robust[:60].max()) == 0
+    assert float((robust(points) - exact).norm()) < 1.3 * best
