@@ -80,3 +80,15 @@ def test_many_right_hand_sides_with_automatic_choice_share_it():
     assert fields[0].choice is fields[1].choice and fields[0].choice.curvature > 0
     with pytest.raises(InvalidInput, match="velocities"):
         Smoother().fit_many(points, velocity, weight)
+
+
+def test_another_frames_choice_is_taken_over_but_outliers_are_judged_anew():
+    points, velocity, weight = frame(0)
+    noise = 0.1 * torch.randn(velocity.shape, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    first = Smoother().fit(points, velocity + noise, weight)
+    spoilt = velocity - noise
+    spoilt[5] += 10.0
+    second = Smoother().fit(points, spoilt, weight, choice=first.choice)
+    assert second.choice.noise == first.choice.noise and second.choice.curvature == first.choice.curvature
+    assert float(second.choice.robust[5]) == 0 and float(first.choice.robust[5]) > 0
+    assert float((second(points) - velocity).square().mean().sqrt()) < 0.06
