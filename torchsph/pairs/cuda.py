@@ -3,10 +3,10 @@
 Search and packing are torch operations on the device; only the pair loop is a Triton kernel.  With
 ``TRITON_INTERPRET=1`` set before triton is imported the same code runs on CPU tensors, slowly, for tests.
 
-Estimate for 3-D, h = 1.2 spacings, continuity, pressure, artificial viscosity and XSPH in float32: a lane meets
-373 candidates (27 cells of 2.4 spacings) for 58 neighbours and spends 57 flop on each, 21 kflop a particle; it
-reads 48 bytes of its own fields and 76 of runs and writes 28, and 40 bytes per candidate, 15 kB a particle, come
-from caches.
+Estimate for 3-D, h = 1.2 spacings, continuity, pressure, artificial viscosity and XSPH in float32: a lane
+meets 373 candidates (27 cells of 2.4 spacings) for 58 neighbours and spends 57 flop on each, 21 kflop a
+particle; it reads 48 bytes of its own fields and 76 of runs and writes 28, and 40 bytes per candidate, 15 kB
+a particle, come from caches.
 """
 
 from __future__ import annotations
