@@ -120,6 +120,8 @@ class PackedSystem:
                 if x is not None:
                     self._subtract_cells(block, index, x, out)
                 continue
+            if x is None and not bool(block.target.any()):
+                continue  # divergence rows add nothing to the right-hand side
             residual = block.target.double().view(len(block), -1)[index].contiguous()
             if x is not None:
                 fitted = torch.empty_like(residual)
