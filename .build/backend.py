@@ -11,6 +11,7 @@ import base64
 import hashlib
 import runpy
 import shutil
+import subprocess
 import sys
 import sysconfig
 import tempfile
@@ -35,7 +36,9 @@ manifest_maker.template = ".build/MANIFEST.in"
 NATIVE = (("torchsph/pairs/build.py", "torchsph/_native"), ("regularize/native_build.py", "regularize"))
 
 
-def build_wheel(wheel_directory: str, config_settings: dict | None = None, metadata_directory: str | None = None) -> str:
+def build_wheel(
+    wheel_directory: str, config_settings: dict | None = None, metadata_directory: str | None = None
+) -> str:
     """Build the wheel and add the libraries that this machine can compile."""
     name = build_meta.build_wheel(wheel_directory, config_settings, metadata_directory)
     with tempfile.TemporaryDirectory(prefix="torchsph-") as scratch:
@@ -47,7 +50,9 @@ def build_wheel(wheel_directory: str, config_settings: dict | None = None, metad
         return _with_libraries(Path(wheel_directory) / name, libraries).name if libraries else name
 
 
-def build_editable(wheel_directory: str, config_settings: dict | None = None, metadata_directory: str | None = None) -> str:
+def build_editable(
+    wheel_directory: str, config_settings: dict | None = None, metadata_directory: str | None = None
+) -> str:
     """Install a link to the source tree, with the libraries compiled into it."""
     for script, folder in NATIVE:
         _compile(script, ROOT / folder)
@@ -58,9 +63,16 @@ def _compile(script: str, folder: Path) -> list[Path]:
     if not (ROOT / script).is_file():
         return []
     if shutil.which("g++") is None and shutil.which("clang++") is None:
-        _say(f"no C++ compiler found: {script} was not run; install g++ or clang++ and reinstall for the fast kernels")
+        _say(
+            f"no C++ compiler found: {script} was not run; install g++ or clang++ and reinstall for the fast kernels"
+        )
         return []
-    made = runpy.run_path(str(ROOT / script))["build"](folder)
+    try:
+        made = runpy.run_path(str(ROOT / script))["build"](folder)
+    except (OSError, RuntimeError, subprocess.CalledProcessError) as problem:
+        # a compiler that cannot do it (no OpenMP, say) must not keep anybody from the torch references
+        _say(f"{script} failed, the install goes on without its kernels: {problem}")
+        return []
     _say(f"compiled {', '.join(path.name for path in made)}")
     return made
 
@@ -78,7 +90,8 @@ def _with_libraries(wheel: Path, libraries: dict[str, Path]) -> Path:
         record = next(name for name in source.namelist() if name.endswith(".dist-info/RECORD"))
         tags = record.removesuffix("RECORD") + "WHEEL"
         files[tags] = (
-            files[tags].decode()
+            files[tags]
+            .decode()
             .replace("Root-Is-Purelib: true", "Root-Is-Purelib: false")
             .replace("Tag: py3-none-any", f"Tag: py3-none-{platform}")
             .encode()

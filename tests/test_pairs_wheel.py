@@ -48,3 +48,14 @@ def test_without_a_compiler_nothing_is_added_and_it_is_said(monkeypatch, tmp_pat
     compile_with = runpy.run_path(str(BACKEND))["_compile"]
     assert compile_with("torchsph/pairs/build.py", tmp_path / "out") == []
     assert "no C++ compiler found" in capsys.readouterr().err
+
+
+def test_compiler_that_fails_does_not_stop_the_install(monkeypatch, tmp_path, capsys):
+    for name in ("g++", "clang++"):
+        (tmp_path / name).write_text("#!/bin/sh\necho no OpenMP here >&2\nexit 1\n")
+        (tmp_path / name).chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:/usr/bin:/bin")
+    monkeypatch.delenv("CXX", raising=False)
+    compile_with = runpy.run_path(str(BACKEND))["_compile"]
+    assert compile_with("torchsph/pairs/build.py", tmp_path / "out") == []
+    assert "no OpenMP here" in capsys.readouterr().err

@@ -12,7 +12,7 @@ from .search import _cells, _key, _shifted, nearest_image
 
 
 def centroid_xsph(state: PairState, support: Support, cell: float, period: Tensor | None = None) -> Tensor:
-    """sum over the own and the adjacent cells c of V_c (v_c - v_a) W(|x_a - X_c|), (N, D), any device.
+    """sum over own and adjacent cells c of V_c (v_c - v_a) W(|x_a - X_c|), (N, D), any device.
 
     V_c is the volume and v_c the mass-weighted mean velocity of the particles in a cell, X_c its middle (Gronli
     2017 section 5.2; the full form is ``RateTerms.xsph``). Costs 3^D evaluations a particle.
