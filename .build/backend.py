@@ -1,8 +1,8 @@
 """PEP 517 build backend: setuptools, plus the compiled kernels.
 
-A wheel is made by setuptools and the shared libraries are then added to it. They are plain C libraries, so the wheel
-serves every Python 3 on the same kind of machine (`py3-none-linux_x86_64`). Without a C++ compiler the wheel is built
-without them and says so; the packages then run on their torch references.
+A wheel is made by setuptools and the shared libraries are then added to it. They are plain C libraries, so
+the wheel serves every Python 3 on the same kind of machine (`py3-none-linux_x86_64`). Without a C++ compiler
+the wheel is built without them and says so; the packages then run on their torch references.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ def _compile(script: str, folder: Path) -> list[Path]:
         return []
     if shutil.which("g++") is None and shutil.which("clang++") is None:
         _say(
-            f"no C++ compiler found: {script} was not run; install g++ or clang++ and reinstall for the fast kernels"
+            f"no C++ compiler found: {script} was not run; install g++ or clang++ and reinstall"
         )
         return []
     try:
@@ -82,7 +82,7 @@ def _say(text: str) -> None:
 
 
 def _with_libraries(wheel: Path, libraries: dict[str, Path]) -> Path:
-    """The wheel with ``libraries`` (name inside -> file) added, tagged for this platform; the given one is removed."""
+    """The wheel with ``libraries`` (name inside -> file), tagged for this platform; the given one is removed."""
     platform = sysconfig.get_platform().replace("-", "_").replace(".", "_")
     target = wheel.with_name(f"{wheel.stem.removesuffix('-py3-none-any')}-py3-none-{platform}.whl")
     with zipfile.ZipFile(wheel) as source, zipfile.ZipFile(target, "w", zipfile.ZIP_DEFLATED) as out:
