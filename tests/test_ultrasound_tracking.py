@@ -58,32 +58,35 @@ def test_a_silent_kernel_correlates_with_nothing():
     assert not rho.abs().any()
 
 
-@pytest.mark.parametrize("axes", [2, 3])
-def test_peak_of_a_paraboloid_is_exact_also_beyond_the_rim(axes):
-    curve = torch.tensor([[0.04, 0.01, 0.0], [0.01, 0.03, 0.01], [0.0, 0.01, 0.05]], dtype=torch.float64)[
-        :axes, :axes
-    ]
-    grid = torch.stack(
-        torch.meshgrid(*[torch.arange(-2.0, 3.0, dtype=torch.float64)] * axes, indexing="ij"), -1
+def gaussian_peak(curve, vertex, lags):
+    """0.9 exp(-quadratic) with second derivatives -curve of its logarithm, times a phase."""
+    axis = torch.arange(-(lags // 2), lags // 2 + 1, dtype=torch.float64)
+    offset = (
+        torch.stack(torch.meshgrid(*[axis] * len(vertex), indexing="ij"), -1) - torch.tensor(vertex).double()
     )
-    for vertex in ([0.3, -0.4, 0.2], [-1.3, 0.9, 0.1], [2.3, 0.0, 0.0]):
-        offset = grid - torch.tensor(vertex[:axes], dtype=torch.float64)
-        surface = 0.9 - 0.5 * torch.einsum("...a,ab,...b->...", offset, curve, offset)
-        peak = find_peak((surface * np.exp(0.7j))[None])
-        np.testing.assert_allclose(peak.lag[0].numpy(), vertex[:axes], atol=1e-9)
-        np.testing.assert_allclose(peak.hessian[0].numpy(), -curve.numpy(), atol=1e-9)
-        assert complex(peak.value[0]) == pytest.approx(0.9 * np.exp(0.7j), abs=1e-9)
-        assert bool(peak.concave)
+    height = 0.9 * torch.exp(-0.5 * torch.einsum("...a,ab,...b->...", offset, curve, offset))
+    return (height * np.exp(0.7j))[None]
+
+
+CURVE = torch.tensor([[0.04, 0.01, 0.0], [0.01, 0.03, 0.01], [0.0, 0.01, 0.05]], dtype=torch.float64)
+
+
+@pytest.mark.parametrize("axes", [2, 3])
+@pytest.mark.parametrize("vertex", [(0.3, -0.4, 0.2), (-1.3, 0.9, 0.1), (2.3, 0.0, 0.0)])
+def test_peak_of_a_gaussian_is_exact_also_beyond_the_rim(axes, vertex):
+    curve = CURVE[:axes, :axes]
+    peak = find_peak(gaussian_peak(curve, vertex[:axes], 5))
+    np.testing.assert_allclose(peak.lag[0].numpy(), vertex[:axes], atol=1e-9)
+    np.testing.assert_allclose(peak.hessian[0].numpy(), -curve.numpy(), atol=1e-9)
+    assert complex(peak.value[0]) == pytest.approx(0.9 * np.exp(0.7j), abs=0.01)  # from a parabola of its own
+    assert bool(peak.concave)
 
 
 def test_a_peak_on_a_given_plane_is_the_highest_there():
     curve = torch.tensor([[0.10, 0.04], [0.04, 0.08]], dtype=torch.float64)
-    grid = torch.stack(torch.meshgrid(*[torch.arange(-1.0, 2.0, dtype=torch.float64)] * 2, indexing="ij"), -1)
-    offset = grid - torch.tensor([0.1, 0.2], dtype=torch.float64)
-    peak = find_peak((0.9 - 0.5 * torch.einsum("yxa,ab,yxb->yx", offset, curve, offset) + 0j)[None])
-    found = peak.constrained(
-        torch.tensor([[1.0, 0.0]], dtype=torch.float64), torch.tensor([0.4], dtype=torch.float64)
-    )
+    peak = find_peak(gaussian_peak(curve, (0.1, 0.2), 3))
+    direction = torch.tensor([[1.0, 0.0]], dtype=torch.float64)
+    found = peak.constrained(direction, torch.tensor([0.4], dtype=torch.float64))
     # with the first lag 0.3 off the vertex the second follows by -curve01 / curve11 times that
     np.testing.assert_allclose(found[0].numpy(), [0.4, 0.2 - 0.5 * 0.3], atol=1e-9)
 

@@ -1,4 +1,8 @@
-"""Where between the nodes a correlation peaks: a paraboloid through the 3^D values around the highest one."""
+"""Where between the nodes a correlation peaks: a paraboloid through the 3^D values around the highest one.
+
+The paraboloid is fitted to the logarithm, so that a Gaussian peak is exact; fitted to the correlation
+itself it is drawn to the nodes by some hundredths of their spacing.
+"""
 
 from __future__ import annotations
 
@@ -17,8 +21,8 @@ FIT_WEIGHTS = (1.0, 1.0, 0.1, 0.01)  # of nodes 0 to 3 steps off the middle
 class Peak:
     """A correlation peak of each point; lags in nodes, in the order of the array's axes.
 
-    lag (P, A): of the vertex, from the middle of the search. hessian (P, A, A) of |rho|, per node squared.
-    value (P,): complex rho at the vertex, |value| <= 1. ratio (P,): of the highest magnitude to the
+    lag (P, A): of the vertex, from the middle of the search. hessian (P, A, A) of log |rho|, per node
+    squared. value (P,): complex rho at the vertex, |value| <= 1. ratio (P,): of the highest magnitude to the
     highest other local maximum, or to the lowest value where there is none. concave (P,): whether the
     paraboloid has a maximum.
     """
@@ -53,7 +57,7 @@ def find_peak(rho: Tensor) -> Peak:
     inner = torch.stack([c.clamp(1, n - 2) for c, n in zip(centre, lags, strict=True)], 1)
     neighbours = _neighbourhood(rho, inner)
     fit = _fit_matrix(len(lags)).to(neighbours.device)
-    terms = neighbours.abs() @ fit.to(flat).T
+    terms = neighbours.abs().clamp_min(1e-6).log() @ fit.to(flat).T
     gradient, hessian = _derivatives(terms, len(lags))
     concave = (torch.linalg.eigvalsh(hessian) < -1e-6).all(-1)
     safe = torch.where(concave[:, None, None], hessian, -torch.eye(len(lags)).to(hessian))

@@ -62,7 +62,7 @@ class SpeckleTracker:
     phase: bool = True
     follow_shear: bool = True
     clutter: ClutterFilter | None = field(default_factory=FIRFilter)
-    min_snr: float | None = 3.0
+    min_snr: float | None = 6.0
     min_blood: float | None = -60.0
     min_correlation: float = 0.7
     lone_correlation: float = 0.8
@@ -90,7 +90,7 @@ class Estimates:
     """What a tracker says of each of n points; components in the order x, y, z.
 
     velocity (n, D) m/s. correlation (n,) of the accepted lag, in [0, 1]. peak_ratio (n,): highest peak of the
-    search over the second. curvature (n, D): -(second derivative of |rho|) / |rho| per axis, 1/m^2. variance
+    search over the second. curvature (n, D): -(second derivative of log |rho|) per axis, 1/m^2. variance
     (n, D): (m/s)^2 up to a constant, what correlation and curvature say of the precision; calibration makes a
     ``sigma`` of it. power (n,): share of the unfiltered power that passed the clutter filter, dB. snr
     (n,): power over thermal noise after the filter, dB (NaN if the noise is unknown). lag (n,): images
@@ -395,7 +395,7 @@ def _precision(
     the carrier if the phase is used.
     """
     metric = torch.outer(spacing, spacing)
-    relative = -peak.hessian / metric / magnitude.clamp_min(1e-6)[:, None, None]
+    relative = -peak.hessian / metric
     noise = (1 - magnitude.square()).clamp_min(1e-6) / magnitude.square().clamp_min(1e-6)
     variance = noise[:, None] * torch.linalg.inv(relative).diagonal(dim1=1, dim2=2).clamp_min(0)
     if options.phase:
