@@ -2,13 +2,15 @@
 
     python examples/benchmarks/pairs.py --quick --json pairs.json
 
-One right-hand side is the continuity rate, pressure (sum form), artificial viscosity and XSPH of a particle in
-a periodic box with 20 % disorder, Wendland C2 with h = 1.2 spacings (60 neighbours). A step adds the search with
-a margin of 0.2 spacings where it is due, the equation of state, a repelling wall and the integration.
+One right-hand side is the continuity rate, pressure (sum form), artificial viscosity and XSPH of a particle
+in a periodic box with 20 % disorder, Wendland C2 with h = 1.2 spacings (60 neighbours). A step adds the
+search with a margin of 0.2 spacings where it is due, the equation of state, a repelling wall and the
+integration.
 
 Competitors take turns, and each keeps its best time; with one thread the time is the processor's, so that
-other programs disturb less, with more threads it is the wall clock's. ``peak_share`` counts the arithmetic on pairs
-inside the support against the multiply-add rate measured in the same run, ``lane_share`` that on all lanes.
+other programs disturb less, with more threads it is the wall clock's. ``peak_share`` counts the arithmetic on
+pairs inside the support against the multiply-add rate measured in the same run, ``lane_share`` that on all
+lanes.
 """
 
 from __future__ import annotations
