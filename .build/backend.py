@@ -82,7 +82,7 @@ def _say(text: str) -> None:
 
 
 def _with_libraries(wheel: Path, libraries: dict[str, Path]) -> Path:
-    """The wheel with ``libraries`` (name inside -> file), tagged for this platform; replaces the given one."""
+    """The wheel with ``libraries`` (name inside -> file), tagged for this platform; replaces the given."""
     platform = sysconfig.get_platform().replace("-", "_").replace(".", "_")
     target = wheel.with_name(f"{wheel.stem.removesuffix('-py3-none-any')}-py3-none-{platform}.whl")
     with zipfile.ZipFile(wheel) as source, zipfile.ZipFile(target, "w", zipfile.ZIP_DEFLATED) as out:
