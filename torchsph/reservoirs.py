@@ -31,8 +31,9 @@ _MOUTH = 0.5
 _KEPT_FRAMES = 64
 # samples of dV/dt between key frames; the flux is linear between them
 _FLUX_SAMPLES = 8
-# the ratio of orifice area to the area that the buffer's particles stand for is trusted this far
-_AREA_TRUST = (0.8, 1.25)
+# the ratio of orifice area to the area that the buffer's particles stand for: beyond these bounds the buffer is being
+# emptied or filled, and following it would let the flow run away
+_AREA_TRUST = (0.5, 2.0)
 
 
 class Reservoirs:

@@ -1,0 +1,124 @@
+"""Wall models: the kernel's share against analytic integrals, potential against autodiff, no slip per time."""
+
+import numpy as np
+import pytest
+import torch
+
+import geometry
+from torchsph.schemes import CompleteKernelWall, PotentialWall
+from torchsph.smoothing import kernel
+from torchsph.wallfield import WallFields, kernel_share
+from torchsph.walls import WallSample, potential, potential_force, retardation
+
+WENDLAND = kernel("wendland_c2")
+
+
+def half_space_share(distance, h):
+    """Integral of the kernel over the half-space x > -distance, by quadrature over plane slices (exact to 1e-6)."""
+    support = WENDLAND.support * h
+    x = torch.linspace(-support, support, 2001, dtype=torch.float64)
+    radius = torch.linspace(0, support, 2001, dtype=torch.float64)
+    slices = torch.stack([
+        torch.trapezoid(WENDLAND.value((radius**2 + s**2).sqrt(), h, 3) * 2 * torch.pi * radius, radius) for s in x
+    ])
+    keep = (x < distance).to(torch.float64)
+    return float(torch.trapezoid(slices * keep, x)), float(np.interp(distance, x.numpy(), slices.numpy()))
+
+
+@pytest.mark.parametrize("distance", [0.0, 0.4, 1.0, 2.0])
+def test_share_behind_a_plane_equals_the_analytic_half_space_integral(distance):
+    """Share within 1 %, its gradient within 2 % of the largest slope, at the look-up spacing of the simulator."""
+    h, step = 1.3, 0.5
+    z = torch.arange(-6.0, 6.0 + step, step, dtype=torch.float64) + 0.13
+    field = z[:, None, None].expand(-1, 9, 9)  # distance from the plane z = 0
+    share, gradient = kernel_share(field, step, WENDLAND, h)
+    at = int((z - distance).abs().argmin())
+    expected, slope = half_space_share(float(z[at]), h)
+    assert float(share[0, at, 4, 4]) == pytest.approx(expected, abs=0.01)
+    largest = half_space_share(0.0, h)[1]
+    assert float(gradient[2, at, 4, 4]) == pytest.approx(slope, abs=0.02 * largest)
+    assert gradient[:2, at, 4, 4].abs().max() < 1e-10
+
+
+def test_share_in_a_right_angled_edge_is_a_quarter():
+    """Within 3 %: the cell that holds the edge counts as cut by one plane."""
+    h, step = 1.3, 0.5
+    axis = torch.arange(-6.0, 6.0 + step, step, dtype=torch.float64)
+    x, z = axis[None, None, :], axis[:, None, None]
+    inside = torch.minimum(x, z)
+    beyond = -torch.sqrt(x.clamp_max(0) ** 2 + z.clamp_max(0) ** 2)
+    field = torch.where(inside > 0, inside, beyond).expand(-1, 9, -1)
+    share, _ = kernel_share(field, step, WENDLAND, h)
+    corner = int((axis == 0).nonzero())
+    assert float(share[0, corner, 4, corner]) == pytest.approx(0.25, abs=0.03)
+    assert float(share[0, -1, 4, -1]) == pytest.approx(1.0, abs=1e-9)
+
+
+def wall(distance, velocity=(0.0, 0.0, 0.0)):
+    d = torch.as_tensor(distance, dtype=torch.float64)
+    normal = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64).expand(len(d), 3)
+    return WallSample(d, normal, torch.tensor([velocity], dtype=torch.float64).expand(len(d), 3))
+
+
+def test_potential_force_is_minus_the_gradient_of_the_potential():
+    model = PotentialWall(stiffness=0.3, reach=1.2)
+    d = torch.tensor([-0.4, 0.1, 0.8, 1.1, 1.5], dtype=torch.float64, requires_grad=True)
+    (slope,) = torch.autograd.grad(potential(model, 2.0, wall(d)).sum(), d)
+    force = potential_force(model, 2.0, wall(d.detach()))
+    torch.testing.assert_close(force[:, 2], -slope)
+    assert force[-1].abs().max() == 0
+
+
+def test_retardation_is_relative_to_the_wall_and_independent_of_the_step():
+    """Errata to 3.2: n small steps do what one step of n times the length does; normal velocity stays."""
+    model, at = PotentialWall(relaxation=0.7), wall([0.2], (0.5, 0.0, 0.3))
+    start = torch.tensor([[2.0, -1.0, 0.9]], dtype=torch.float64)
+    once = retardation(model, 1.5, torch.tensor([0.4], dtype=torch.float64), start, at)
+    many = start
+    for _ in range(8):
+        many = retardation(model, 1.5, torch.tensor([0.05], dtype=torch.float64), many, at)
+    torch.testing.assert_close(once, many)
+    assert float(once[0, 2]) == 0.9
+    assert 0.5 < float(once[0, 0]) < 2.0
+    torch.testing.assert_close(retardation(model, 1.5, torch.ones(1).double(), at.velocity, at), at.velocity)
+
+
+def fields(surface, spacing=1e-3, model=None):
+    motion = geometry.WallMotion.at_rest(surface)
+    complete = isinstance(model or CompleteKernelWall(), CompleteKernelWall)
+    return WallFields(motion, spacing, 1.0, WENDLAND, 1.3, complete, "cpu", torch.float64)
+
+
+def test_look_up_fields_of_a_box_are_exact_near_its_sides():
+    made = fields(geometry.box((0, 0, 0), (0.02, 0.012, 0.012), 2e-3))
+    key = made.key(0, ())
+    points = torch.tensor([[10.0, 6.0, 0.3], [10.0, 6.0, -0.4], [0.7, 6.0, 6.0]], dtype=torch.float64)
+    seen = made.sample(key, key, torch.zeros(()).double(), points)
+    torch.testing.assert_close(seen.distance, torch.tensor([0.3, -0.4, 0.7]).double(), atol=1e-6, rtol=0)
+    torch.testing.assert_close(seen.normal[0], torch.tensor([0.0, 0, 1]).double(), atol=1e-6, rtol=0)
+    assert seen.share is not None
+    assert float(seen.share[0]) == pytest.approx(half_space_share(0.3, 1.3)[0], abs=0.012)
+
+
+def test_potential_walls_store_no_kernel_share():
+    made = fields(geometry.box((0, 0, 0), (0.02, 0.012, 0.012), 2e-3), model=PotentialWall())
+    key = made.key(0, ())
+    assert key.shape[0] == 7
+    assert made.sample(key, key, torch.zeros(()).double(), torch.ones(1, 3).double()).share is None
+
+
+def test_an_open_orifice_is_no_wall():
+    """Under the middle of the open inlet the nearest wall is its rim; the channel behind it counts as fluid."""
+    ventricle = geometry.Ventricle()
+    made = fields(ventricle.surface(1e-3), 1.5e-3)
+    centre = torch.tensor([[ventricle.mitral_centre[0], 0.0, -0.5e-3]], dtype=torch.float64) / 1.5e-3
+    above = centre * torch.tensor([1.0, 1.0, -1.0]).double()
+    shut, opened = made.key(0, ()), made.key(0, (1,))
+    zero = torch.zeros(()).double()
+    assert float(made.sample(shut, shut, zero, centre).distance) == pytest.approx(1 / 3, abs=0.02)
+    assert float(made.sample(opened, opened, zero, centre).distance) > 1.5
+    assert float(made.sample(shut, shut, zero, above).distance) < 0
+    assert float(made.sample(opened, opened, zero, above).distance) > 1.5
+    assert float(made.sample(opened, opened, zero, centre).share) > 0.9 > float(
+        made.sample(shut, shut, zero, centre).share
+    )
