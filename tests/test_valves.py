@@ -40,9 +40,9 @@ def test_the_open_valve_passes_what_the_volume_demands(scene, start, stop):
     p, unit = run.particles, scene.spacing**3
     volume = float(p.mass[p.fluid].sum()) * unit
     change = VENTRICLE.volume(stop) - VENTRICLE.volume(start)
-    # one layer of particles over the orifice (12 of them at this spacing) is on its way through at any time
+    # with a flat profile the buffer passes the plane layer by layer (12 particles each at this spacing)
     layer = 12 * float(p.mass.mean()) * unit
-    assert abs(volume - VENTRICLE.volume(stop)) < 0.6 * layer
+    assert abs(volume - VENTRICLE.volume(stop)) < layer
     assert abs(change) > 5 * layer
     assert not run.record.failed.any()
     assert int(run.record.crossed_wall.sum()) < 0.02 * p.count
