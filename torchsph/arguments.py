@@ -93,13 +93,24 @@ def _measure(parser: Parser, _: tuple[str, ...]) -> None:
     """Simulate what an ultrasound scanner would measure of a true recording."""
     parser.add_argument("true", metavar="TRUE.h5")
     parser.add_argument("--out", required=True, metavar="M.h5", help="the measured recording")
-    parser.add_argument("--mode", choices=("noise",), default="noise", help="how (%(default)s)")
-    parser.add_argument("--every", type=whole(1), metavar="K", help="keep each K-th frame")
-    parser.add_argument("--lateral", type=number(0), metavar="S", help="noise across the beam, m/s")
-    parser.add_argument("--axial", type=number(0), metavar="S", help="noise along the beam, m/s")
     parser.add_argument(
+        "--mode",
+        choices=("noise", "speckle", "doppler"),
+        default="noise",
+        help="a noise model, or simulated echoes with speckle tracking or colour Doppler (%(default)s)",
+    )
+    parser.add_argument("--every", type=whole(1), metavar="K", help="keep each K-th frame")
+    noise = parser.add_argument_group("noise")
+    noise.add_argument("--lateral", type=number(0), metavar="S", help="noise across the beam, m/s")
+    noise.add_argument("--axial", type=number(0), metavar="S", help="noise along the beam, m/s")
+    noise.add_argument(
         "--outliers", type=number(0, 1), metavar="P", help="share of nodes that hop to a false peak"
     )
+    echoes = parser.add_argument_group("speckle, doppler")
+    echoes.add_argument("--snr", type=number(-100), metavar="DB", help="of the blood's echoes")
+    echoes.add_argument("--prf", type=number(0, open_below=True), metavar="HZ", help="pulses per second")
+    echoes.add_argument("--packet", type=whole(2), metavar="N", help="frames of echoes per estimate")
+    echoes.add_argument("--clutter", type=number(0), metavar="DB", help="tissue over blood inside the cavity")
     parser.add_argument(
         "--seed", type=whole(0), default=0, metavar="N", help="of everything random (%(default)s)"
     )

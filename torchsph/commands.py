@@ -5,8 +5,9 @@ from __future__ import annotations
 import argparse
 import shutil
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,12 +22,14 @@ from torchsph.outputs import output_folder, staged, write_json
 
 __all__ = ["COMMANDS"]
 
+MEASURE_FLAGS = ("every", "lateral", "axial", "outliers", "snr", "prf", "packet", "clutter")
+
 
 def assimilate(args: argparse.Namespace) -> None:
     """`torchsph assimilate`: every asked method on one measurement, scored, drawn and written."""
     measured_path, truth_path, methods = _assimilate_inputs(args)
     folder, device = output_folder(args.out), _device(args.device)
-    measured = geometry.read_recording(measured_path)
+    measured = _full_vectors(geometry.read_recording(measured_path), measured_path)
     truth = None if truth_path is None else geometry.read_recording(truth_path)
     _check_spacing(args.spacing, measured)
     scores = {
@@ -97,7 +100,7 @@ def metrics_document(
 def forecast(args: argparse.Namespace) -> None:
     """`torchsph forecast`: skill of the simulator against lead time, beside persistence."""
     folder, device = output_folder(args.out), _device(args.device)
-    recording = geometry.read_recording(args.recording)
+    recording = _full_vectors(geometry.read_recording(args.recording), args.recording)
     _check_spacing(args.spacing, recording)
     leads = _leads_within(args.leads, recording, args.every)
     skill = pipeline.forecast_skill(
@@ -148,24 +151,33 @@ def _leads_within(
 
 
 def measure(args: argparse.Namespace) -> None:
-    """`torchsph measure`: a measurement of a true recording, by a noise model."""
-    from torchsph.ultrasound.noise import NoiseModel, measure_noise
+    """`torchsph measure`: a measurement of a true recording, by a noise model or from simulated echoes."""
+    from torchsph import ultrasound
 
+    makers: dict[str, tuple[type, Callable[..., geometry.Recording]]] = {
+        "noise": (ultrasound.NoiseModel, ultrasound.measure_noise),
+        "speckle": (ultrasound.SpeckleOptions, partial(ultrasound.measure_speckle, progress=True)),
+        "doppler": (ultrasound.DopplerOptions, partial(ultrasound.measure_doppler, progress=True)),
+    }
+    kind, make = makers[args.mode]
     path = _output_file(args.out)
-    given = {one.name: getattr(args, one.name, None) for one in fields(NoiseModel)}
-    options = NoiseModel(**{name: value for name, value in given.items() if value is not None})
+    known = {one.name for one in fields(kind)}
+    given = {name: value for name in MEASURE_FLAGS if (value := getattr(args, name)) is not None}
+    foreign = [f"--{name}" for name in given if name not in known]
+    if foreign:
+        raise ValueError(f"{', '.join(foreign)}: means nothing with --mode {args.mode}")
     true = geometry.read_recording(args.true)
-    measured = measure_noise(true, options, args.seed)
+    measured = make(true, kind(**given), args.seed)
     geometry.write_recording(path, measured)
-    raw = metrics.evaluate(measured, true)
-    _print_table(report.scores_table({"raw": raw}, {}))
+    if measured.beam is None:
+        _print_table(report.scores_table({"raw": metrics.evaluate(measured, true)}, {}))
     _say(f"wrote {len(measured.time)} frames to {path}")
 
 
 def smooth(args: argparse.Namespace) -> None:
     """`torchsph smooth`: a B-spline field for each frame."""
     path = _output_file(args.out)
-    measured = geometry.read_recording(args.measurement)
+    measured = _full_vectors(geometry.read_recording(args.measurement), args.measurement)
     smoothed = pipeline.smooth(measured, progress=True)
     geometry.write_recording(path, smoothed)
     scores = {
@@ -182,9 +194,13 @@ def info(args: argparse.Namespace) -> None:
     if args.backends:
         from torchsph.pairs.registry import available_backends
 
-        device = "cuda" if torch.cuda.is_available() else "cpu"
-        rows = [[one.name, "yes" if one.present else "no", one.reason] for one in available_backends(device)]
-        _print_table([["backend", "present", "why"], *rows], text=True)
+        devices = ("cpu", "cuda") if torch.cuda.is_available() else ("cpu",)
+        rows = [
+            [one.name, device, "yes" if one.present else "no", one.reason]
+            for device in devices
+            for one in available_backends(device)
+        ]
+        _print_table([["backend", "device", "present", "why"], *rows], text=True)
     if args.file is not None:
         _print_table(summary_table(geometry.read_recording(args.file)), text=True)
 
@@ -225,6 +241,15 @@ def _mm(lengths: Sequence[float]) -> str:
 
 def _rms(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean(values.astype(np.float64) ** 2))) if values.size else 0.0
+
+
+def _full_vectors(recording: geometry.Recording, path: str | Path) -> geometry.Recording:
+    if recording.beam is not None:
+        raise ValueError(
+            f"{path}: /beam: holds one component along a beam (Doppler); the methods need full vectors, as "
+            "speckle tracking or vector Doppler give them"
+        )
+    return recording
 
 
 def _device(name: str) -> str:
