@@ -4,6 +4,17 @@ import numpy as np
 import torch
 from scipy.linalg.blas import dsbmv
 
+ROWS = 256  # copied at a time
+
+
+def to_single(band: torch.Tensor) -> torch.Tensor:
+    """The band in float32 within the memory of the given float64 one, which is lost."""
+    count, width = band.shape
+    single = band.view(-1).view(torch.float32)[: count * width].view(count, width)
+    for start in range(0, count, ROWS):  # a row moves to the front of where it stood, or before
+        single[start : start + ROWS] = band[start : start + ROWS].float()
+    return single
+
 
 def widen(scalar: torch.Tensor, scale: torch.Tensor) -> torch.Tensor:
     """Band of kron(scalar matrix, diag(scale)): component c of every coefficient is scaled by scale (C,)."""

@@ -9,6 +9,7 @@ from scipy.linalg.blas import dtbmv, dtbsv
 
 from . import native
 from .assembly import reference_band
+from .banded import to_single
 from .block import BlockFactor
 from .errors import InvalidInput, NotConverged
 from .krylov import Solution
@@ -47,6 +48,12 @@ class PreparedSystem:
         """Lower band (unknowns, width) of the normal matrix, float64."""
         return reference_band(self.system, self.ordering) if self._packed is None else self._packed.band()
 
+    def single_factor(self) -> "Factor | BlockFactor":
+        """Cholesky factor in float32: half the time and memory; InvalidInput where it breaks down."""
+        if self.ordering.nodes.device.type == "cpu":
+            return Factor(to_single(self.band()), self.ordering)
+        return BlockFactor(self.band().float(), self.ordering)
+
     def factor(self) -> "Factor | BlockFactor":
         """Cholesky factor of the normal matrix; InvalidInput where it is not positive definite.
 
@@ -82,8 +89,8 @@ class PreparedSystem:
 class Factor:
     """Cholesky factor of a normal matrix; serves any right-hand sides of the same rows and weights.
 
-    ``band`` (unknowns, width) is the lower band as in :func:`regularize.assembly.empty_band`; it is
-    overwritten.
+    ``band`` (unknowns, width) is the lower band as in :func:`regularize.assembly.empty_band`, float64 or
+    float32; it is overwritten.
     """
 
     def __init__(self, band: torch.Tensor, ordering: Ordering) -> None:
@@ -98,9 +105,9 @@ class Factor:
 
     def solve(self, right: torch.Tensor) -> torch.Tensor:
         """(active, C) or (active, C, k) in solve order -> the same shape."""
-        flat = right.double().reshape(right.shape[0] * right.shape[1], *right.shape[2:])
-        solved = cho_solve_banded((self.band, True), flat.numpy(), check_finite=False)
-        return torch.from_numpy(solved).view(right.shape)
+        flat = right.reshape(right.shape[0] * right.shape[1], *right.shape[2:]).numpy()
+        solved = cho_solve_banded((self.band, True), flat.astype(self.band.dtype), check_finite=False)
+        return torch.from_numpy(solved).double().view(right.shape)
 
     def spread(self, white: torch.Tensor) -> torch.Tensor:
         """The factor times white (unknowns, k): draws whose covariance is the factored matrix."""
@@ -131,34 +138,62 @@ def solve_direct(
     factor: Factor | None = None,
     tolerance: float = 1e-6,
     refinements: int = 3,
+    single: bool = False,
     strict: bool = True,
 ) -> tuple[Solution, Factor]:
     """Solve by Cholesky and refine until the true relative gradient is below ``tolerance``.
 
     ``Solution.x`` is (nodes * C,) over all coefficients of the knot grid. A given ``factor`` (of the same
-    rows, or of similar ones) is used instead of a new one. Raises NotConverged unless ``strict`` is False.
+    rows, or of similar ones) is used instead of a new one. ``single`` tries a float32 factor, refined in
+    float64 on the rows, and goes on to a float64 one where that breaks down or stalls. Raises NotConverged
+    unless ``strict`` is False.
     """
     prepared = system if isinstance(system, PreparedSystem) else PreparedSystem(system)
-    factor = prepared.factor() if factor is None else factor
     right = prepared.gradient()
-    scale = float(right.norm())
-    if scale == 0:
-        x = prepared.expand(torch.zeros_like(right)).flatten()
-        return Solution(x, 0.0, 0, "zero right-hand side", "direct"), factor
-    x = factor.solve(right)
-    for count in range(1, refinements + 2):
-        gradient = prepared.gradient(x)
-        relative = float(gradient.norm()) / scale
-        if relative <= tolerance or count == refinements + 1:
-            break
-        x = x + factor.solve(gradient)
-    reason = "gradient below tolerance" if relative <= tolerance else "refinement stalled"
-    solution = Solution(prepared.expand(x).flatten(), relative, count, reason, "direct")
-    if relative > tolerance and strict:
+    if single and factor is None:
+        found = _solve_single(prepared, right, tolerance, refinements)
+        if found is not None:
+            return found
+    factor = prepared.factor() if factor is None else factor
+    solution = _refine(prepared, factor, right, tolerance, refinements)
+    if solution.gradient > tolerance and strict:
         raise NotConverged(
-            f"direct solve: true relative gradient {relative:.2e} after {count - 1} refinements, asked for "
-            f"{tolerance:.1e}; the system is nearly singular: raise curvature or damping, or lower "
-            "divergence and wall",
+            f"direct solve: true relative gradient {solution.gradient:.2e} after {solution.iterations - 1} "
+            f"refinements, asked for {tolerance:.1e}; the system is nearly singular: raise curvature or "
+            "damping, or lower divergence and wall",
             solution,
         )
     return solution, factor
+
+
+def _solve_single(
+    prepared: PreparedSystem, right: torch.Tensor, tolerance: float, refinements: int
+) -> tuple[Solution, Factor] | None:
+    """Solution by a float32 factor; None where it cannot reach the tolerance (float64 then has to)."""
+    try:
+        factor = prepared.single_factor()
+    except InvalidInput:  # positive definite in float64 perhaps
+        return None
+    solution = _refine(prepared, factor, right, tolerance, refinements)
+    return (solution, factor) if solution.gradient <= tolerance else None
+
+
+def _refine(
+    prepared: PreparedSystem, factor: Factor, right: torch.Tensor, tolerance: float, refinements: int
+) -> Solution:
+    """Solve and refine until the gradient, recomputed on the rows, is small or no longer halves."""
+    scale = float(right.norm())
+    if scale == 0:
+        x = prepared.expand(torch.zeros_like(right)).flatten()
+        return Solution(x, 0.0, 0, "zero right-hand side", "direct")
+    x = factor.solve(right)
+    before = float("inf")
+    for count in range(1, refinements + 2):
+        gradient = prepared.gradient(x)
+        relative = float(gradient.norm()) / scale
+        if relative <= tolerance or count == refinements + 1 or not relative < 0.5 * before:
+            break
+        before = relative
+        x = x + factor.solve(gradient)
+    reason = "gradient below tolerance" if relative <= tolerance else "refinement stalled"
+    return Solution(prepared.expand(x).flatten(), relative, count, reason, "direct")

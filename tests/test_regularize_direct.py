@@ -140,3 +140,21 @@ def test_singular_system_is_named():
     system = System(knots, 2, [VectorRows(knots, points, draw, weight[:, None])], 0.0)
     with pytest.raises(InvalidInput, match="curvature or damping"):
         solve_direct(system)
+
+
+def test_float32_factor_refined_equals_float64():
+    knots, blocks = blocks_of(3)
+    system = System(knots, 3, list(blocks.values()), 0.3)
+    double, _ = solve_direct(system, tolerance=1e-12)
+    single, factor = solve_direct(system, tolerance=1e-12, single=True)
+    assert factor.band.dtype == "float32" and single.gradient <= 1e-12 and single.iterations > 1
+    assert torch.allclose(single.x, double.x, atol=1e-10)
+
+
+@pytest.mark.parametrize("damping", [1e-6, 1e-4])
+def test_float32_factor_that_fails_gives_way_to_float64(damping):
+    knots, points, draw, _, _ = make(2, n=6)
+    rows = VectorRows(knots, points, draw, torch.full((6, 1), 1e2, dtype=torch.float64))
+    system = System(knots, 2, [rows], damping)
+    solution, factor = solve_direct(system, tolerance=1e-6, single=True)
+    assert factor.band.dtype == "float64" and solution.gradient <= 1e-6

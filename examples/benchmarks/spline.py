@@ -78,9 +78,10 @@ def relative_gradient(rows: rg.System, x: torch.Tensor) -> float:
     return float(rows.gradient(x).norm() / rows.right_side().norm())
 
 
-def run_direct(rows: rg.System, engine: str | None) -> dict:
+def run_direct(rows: rg.System, engine: str | None, single: bool = False) -> dict:
     start = clock()
-    solution, _ = rg.solve_direct(rg.PreparedSystem(rows, engine=engine), tolerance=TOLERANCE)
+    prepared = rg.PreparedSystem(rows, engine=engine)
+    solution, _ = rg.solve_direct(prepared, tolerance=TOLERANCE, single=single)
     return took(start) | {"gradient": relative_gradient(rows, solution.x), "iterations": solution.iterations}
 
 
@@ -174,6 +175,7 @@ def one_row(solver: str, samples: int, nodes: tuple[int, ...]) -> dict:
     before = int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
     runs = {
         "direct": lambda rows: run_direct(rows, None),
+        "direct, float32 factor": lambda rows: run_direct(rows, None, single=True),
         "direct, torch reference": lambda rows: run_direct(rows, "reference"),
         "next frame, same weights": run_next_frame,
         "next frame, new weights": lambda rows: run_new_weights(rows, samples, nodes),
@@ -197,12 +199,14 @@ def one_row(solver: str, samples: int, nodes: tuple[int, ...]) -> dict:
 def plan(quick: bool) -> list[tuple[str, int, tuple[int, ...]]]:
     if quick:
         nodes = (16, 10, 10)
-        solvers = ("direct", "direct, torch reference", "next frame, same weights", "next frame, new weights")
-        rows = [(s, 3000, nodes) for s in (*solvers, "LSQR, CSR and transpose", "SciPy LSQR")]
+        solvers = ("direct", "direct, float32 factor", "direct, torch reference")
+        frames = ("next frame, same weights", "next frame, new weights")
+        rows = [(s, 3000, nodes) for s in (*solvers, *frames, "LSQR, CSR and transpose", "SciPy LSQR")]
         return rows + [("noise-free fit", 20000, n) for n in ((16, 8, 8), (24, 12, 12))]
     nodes, rows = (32, 16, 16), []
     for samples in (20000, 200000):
-        for solver in ("direct", "next frame, same weights", "next frame, new weights"):
+        frames = ("next frame, same weights", "next frame, new weights")
+        for solver in ("direct", "direct, float32 factor", *frames):
             rows.append((solver, samples, nodes))
     few = (
         "direct, torch reference",
