@@ -49,6 +49,7 @@ class Domain:
         self._times: Tensor | None = None
         if scene.walls is not None:
             complete = isinstance(scheme.wall, CompleteKernelWall)
+            self._check_periodic_walls()
             self.walls = WallFields(
                 scene.walls, units.length, units.speed, smoothing, scheme.smoothing_ratio, complete, device, dtype
             )
@@ -68,6 +69,31 @@ class Domain:
             return None
         lengths = [float("inf") if p is None else p / self.units.length for p in self.scene.period]
         return torch.tensor(lengths, dtype=self.dtype, device=self.device)
+
+    def _check_periodic_walls(self) -> None:
+        """Walls of a periodic scene must reach past both ends, because what a particle sees is looked up inside.
+
+        Raises ValueError where they end within a kernel of the periodic box.
+        """
+        reach = (self.support_radius + 1.0) * self.units.length
+        for axis, length in enumerate(self.scene.period or ()):
+            if length is None:
+                continue
+            ends = self.scene.walls.vertices_at_keys[..., axis]
+            if ends.min() > -reach or ends.max() < length + reach:
+                raise ValueError(
+                    f"axis {axis} is periodic over {length:g} m, but the walls span only {ends.min():g} to "
+                    f"{ends.max():g} m there; continue them unchanged at least {reach:g} m past both ends"
+                )
+
+    def fluid_volume(self, time: float) -> float:
+        """Volume (area in a plane) that the walls enclose in one period, m^D."""
+        motion = self.scene.walls
+        volume, vertices = motion.volume(time), motion.vertices(time)
+        for axis, length in enumerate(self.scene.period or ()):
+            if length is not None:
+                volume *= length / (vertices[:, axis].max() - vertices[:, axis].min())
+        return volume
 
     def breaks(self, start: float, stop: float) -> list[float]:
         """The times in (start, stop] at which members meet: key frames, valve events, and ``stop``."""
@@ -127,14 +153,14 @@ class Domain:
             share = (self._times - early) / (late - early)
             fraction = share.clamp(0.0, 1.0).to(self.dtype)
             fraction = per_particle(fraction, particles.member) if fraction.ndim else fraction
-        return self.walls.sample(*self._keys, fraction, particles.position)
+        return self.walls.sample(*self._keys, fraction, self._wrapped_points(particles.position))
 
     def sample_at(self, position: Tensor) -> WallSample:
         """Walls at points (n, D), internal, at the present time (one for all members)."""
         early, late = self._bracket
         share = float((self._times.max() - early) / (late - early)) if late > early else 0.0
         fraction = torch.full((), min(max(share, 0.0), 1.0), dtype=self.dtype, device=self.device)
-        return self.walls.sample(*self._keys, fraction, position)
+        return self.walls.sample(*self._keys, fraction, self._wrapped_points(position))
 
     def body_force(self, particles: Particles) -> Tensor | None:
         """Acceleration (N, D) by gravity and pressure sources, or None."""
@@ -186,12 +212,17 @@ class Domain:
         )
 
     def _wrapped(self, particles: Particles) -> Particles:
+        return particles if self.period is None else particles.changed(
+            position=self._wrapped_points(particles.position)
+        )
+
+    def _wrapped_points(self, position: Tensor) -> Tensor:
+        """Points (n, D), internal, brought back into the periodic box."""
         if self.period is None:
-            return particles
+            return position
         finite = torch.isfinite(self.period)
         length = torch.where(finite, self.period, torch.ones_like(self.period))
-        inside = torch.where(finite, torch.remainder(particles.position, length), particles.position)
-        return particles.changed(position=inside)
+        return torch.where(finite, torch.remainder(position, length), position)
 
     def account(self, particles: Particles, record: Record, time: float) -> None:
         """Count the particles that are beyond the walls now."""

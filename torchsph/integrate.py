@@ -11,6 +11,7 @@ from torch import Tensor
 from .pairs.interface import Backend, MomentumTerms, Rates, RateTerms, Support, per_particle
 from .particles import Particles
 from .schemes import CompleteKernelWall, PotentialWall, WeaklyCompressible
+from .second_order import predictor_corrector_step, verlet_step
 from .smoothing import kernel
 from .terms import shifting_displacement, tait_pressure
 from .walls import WallSample, friction, potential_force, retardation, wall_pressure_force
@@ -75,6 +76,16 @@ class Coefficients:
     smoothing_length: float
 
 
+@dataclass(frozen=True)
+class RateSums:
+    """Density rate (N,), velocity divergence (N,), crowding gradient (N, D) or None, and the raw sums."""
+
+    rate: Tensor
+    divergence: Tensor
+    crowding: Tensor | None
+    sums: Rates
+
+
 class Stepper:
     """Steps particles with one scheme; holds no state but the neighbour list."""
 
@@ -87,7 +98,8 @@ class Stepper:
         self.velocity_xsph = scheme.xsph.epsilon if velocity_xsph else None
         self.position_xsph = scheme.xsph.epsilon if scheme.xsph is not None and not velocity_xsph else None
         self.momentum_terms = MomentumTerms(
-            pressure=scheme.pressure, artificial=coefficients.artificial, laminar=coefficients.viscosity
+            pressure=scheme.pressure, artificial=coefficients.artificial, laminar=coefficients.viscosity,
+            tensile=scheme.tensile,
         )
         self._rate_terms = RateTerms(
             continuity=scheme.continuity, diffusion=scheme.density_diffusion is not None,
@@ -104,6 +116,10 @@ class Stepper:
         """
         if self.scheme.order == "thesis":
             return self._thesis_step(particles, step, number, around)
+        if self.scheme.order == "verlet":
+            return verlet_step(self, particles, step, around)
+        if self.scheme.order == "predictor_corrector":
+            return predictor_corrector_step(self, particles, step, around)
         return self._symplectic_step(particles, step, number, around)
 
     def _symplectic_step(
@@ -118,19 +134,31 @@ class Stepper:
         rates = self.pair_search.backend.rates(pairs, self._pressureless(particles), self.support, terms)
         compression, crowding = self._complete(particles, rates, wall)
         particles = self._new_density(particles, rates, compression, dt, filtering)
-        acceleration = self._acceleration(particles, pairs, compression, wall, around)
+        acceleration = self.acceleration(particles, pairs, compression, wall, around)
         fluid = particles.fluid[:, None]
         velocity = torch.where(fluid, particles.velocity + dt[:, None] * acceleration, particles.velocity)
-        particles = self._retarded(particles.changed(velocity=velocity), wall, dt)
-        drift = dt[:, None] * particles.velocity
-        if rates.xsph is not None:
-            drift = drift + torch.where(fluid, self.position_xsph * dt[:, None] * rates.xsph, 0.0)
-        if crowding is not None:
-            shift = shifting_displacement(
-                particles, crowding, step, self.coefficients.smoothing_length, self.scheme.shifting
-            )
-            drift = drift + torch.where(fluid, shift, 0.0)
+        particles = self.retarded(particles.changed(velocity=velocity), wall, dt)
+        drift = dt[:, None] * particles.velocity + self.wandering(particles, rates, crowding, step)
         return particles.changed(position=particles.position + drift), acceleration, wall
+
+    def wandering(self, particles: Particles, rates: Rates, crowding: Tensor | None, step: Tensor) -> Tensor:
+        """What moves particles in a step beside their velocity: position XSPH and shifting, (N, D)."""
+        drift = torch.zeros_like(particles.position)
+        if rates.xsph is not None:
+            dt = per_particle(step, particles.member)
+            drift = drift + self.position_xsph * dt[:, None] * rates.xsph
+        if crowding is not None:
+            drift = drift + shifting_displacement(
+                particles, crowding, step, self.coefficients.smoothing_length, self.scheme.shifting,
+                self.scheme.shifting_speed == "largest",
+            )
+        return torch.where(particles.fluid[:, None], drift, torch.zeros_like(drift))
+
+    def evaluate_rates(self, particles: Particles, pairs: Any, wall: WallSample | None) -> RateSums:
+        """Density rate and its companions at one state."""
+        sums = self.pair_search.backend.rates(pairs, self._pressureless(particles), self.support, self._rate_terms)
+        divergence, crowding = self._complete(particles, sums, wall)
+        return RateSums(self._density_rate(particles, sums, divergence), divergence, crowding, sums)
 
     def _thesis_step(
         self, particles: Particles, step: Tensor, number: int, around: Surroundings
@@ -148,9 +176,9 @@ class Stepper:
         particles = self._new_density(particles, rates, compression, dt, filtering=False)
         particles = particles.changed(position=particles.position + dt[:, None] * particles.velocity)
         pairs, wall = self.pair_search.at(particles), around.sample(particles)
-        acceleration = self._acceleration(particles, pairs, compression, wall, around)
+        acceleration = self.acceleration(particles, pairs, compression, wall, around)
         particles = particles.changed(velocity=particles.velocity + dt[:, None] * acceleration)
-        particles = self._retarded(particles, wall, dt)
+        particles = self.retarded(particles, wall, dt)
         filtering = self._filter_due(number)
         if self.velocity_xsph is not None or filtering:
             wanted = RateTerms(continuity=None, xsph=self.velocity_xsph is not None, shepard=filtering)
@@ -195,14 +223,17 @@ class Stepper:
     def _new_density(
         self, particles: Particles, rates: Rates, divergence: Tensor, dt: Tensor, filtering: bool
     ) -> Particles:
+        deviation = particles.deviation + dt * self._density_rate(particles, rates, divergence)
+        if filtering:
+            deviation = _filtered(particles.changed(deviation=deviation), rates, dt)
+        return particles.changed(deviation=deviation)
+
+    def _density_rate(self, particles: Particles, rates: Rates, divergence: Tensor) -> Tensor:
         rate = -(1.0 + particles.deviation) * divergence
         if rates.diffusion is not None:
             sound = per_particle(self.coefficients.sound_speed, particles.member)
             rate = rate + self.scheme.density_diffusion * self.coefficients.smoothing_length * sound * rates.diffusion
-        deviation = particles.deviation + dt * rate
-        if filtering:
-            deviation = _filtered(particles.changed(deviation=deviation), rates, dt)
-        return particles.changed(deviation=deviation)
+        return rate
 
     def pressure(self, particles: Particles, divergence: Tensor | None = None) -> Tensor:
         """p / rho0 (N,): equation of state, background (symmetric form only), damping of sound.
@@ -218,9 +249,10 @@ class Stepper:
             pressure = pressure - torch.where(particles.fluid, damping, torch.zeros_like(damping))
         return pressure
 
-    def _acceleration(
+    def acceleration(
         self, particles: Particles, pairs: Any, divergence: Tensor, wall: WallSample | None, around: Surroundings
     ) -> Tensor:
+        """Acceleration (N, D) by pairs, walls and body forces at one state."""
         pressure = self.pressure(particles, divergence)
         state = particles.state(pressure)
         acceleration = self.pair_search.backend.momentum(pairs, state, self.support, self.momentum_terms)
@@ -237,7 +269,8 @@ class Stepper:
             acceleration = acceleration + potential_force(self.scheme.wall, sound, wall)
         return acceleration if body is None else acceleration + body
 
-    def _retarded(self, particles: Particles, wall: WallSample | None, dt: Tensor) -> Particles:
+    def retarded(self, particles: Particles, wall: WallSample | None, dt: Tensor) -> Particles:
+        """Velocities slowed down by a potential wall with friction; other walls act through the acceleration."""
         model = self.scheme.wall
         if wall is None or not isinstance(model, PotentialWall) or model.relaxation is None:
             return particles

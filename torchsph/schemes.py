@@ -7,6 +7,8 @@ from dataclasses import dataclass, field, replace
 from .pairs.interface import CONTINUITY_FORMS, PRESSURE_FORMS
 from .smoothing import kernel
 
+ORDERS = ("thesis", "symplectic", "verlet", "predictor_corrector")
+
 
 @dataclass(frozen=True)
 class XSPH:
@@ -114,7 +116,12 @@ class WeaklyCompressible:
         bulk_damping: coefficient of a pressure -b c h div v that damps sound, or None.
         shepard_period: steps between Shepard filters of the density (2.20), or None.
         wall: wall model for scenes with walls; valve: valve model for scenes with valves (None: stays shut).
-        order: "thesis" steps as algorithm 1; "symplectic" evaluates both passes at one position.
+        shifting_speed: the speed in the shifting: "local" (the particle's own) or "largest" (of its member: also
+            stagnation points are evened out, which a vortex needs and a jet in a resting chamber does not).
+        tensile: R of Monaghan's tensile correction (2000; 0.2 there, symmetric pressure form only), or None.
+        order: "thesis" steps as algorithm 1; "symplectic" evaluates both passes at one position (symplectic Euler);
+            "verlet" is the position Verlet scheme, "predictor_corrector" the symplectic predictor-corrector, both of
+            second order (module ``second_order``).
         courant: fraction of the acoustic limit h / (c + v), of h^2/(8 nu) and of sqrt(h / |a|) / 2.
         steps_per_frame: at least so many steps between imposed frames, or None.
     """
@@ -131,6 +138,8 @@ class WeaklyCompressible:
     density_diffusion: float | None = 0.1
     xsph: XSPH | None = None
     shifting: float | None = 0.5
+    shifting_speed: str = "local"
+    tensile: float | None = None
     bulk_damping: float | None = 0.3
     shepard_period: int | None = None
     wall: PotentialWall | CompleteKernelWall = field(default_factory=CompleteKernelWall)
@@ -149,7 +158,8 @@ class WeaklyCompressible:
             if value is not None and not value >= 0:
                 raise ValueError(f"WeaklyCompressible.{name} must not be negative, got {value}")
         for name, known in (
-            ("continuity", CONTINUITY_FORMS), ("pressure", PRESSURE_FORMS), ("order", ("thesis", "symplectic")),
+            ("continuity", CONTINUITY_FORMS), ("pressure", PRESSURE_FORMS), ("order", ORDERS),
+            ("shifting_speed", ("local", "largest")),
         ):
             if getattr(self, name) not in known:
                 raise ValueError(f"WeaklyCompressible.{name} must be one of {known}, got '{getattr(self, name)}'")
@@ -157,6 +167,21 @@ class WeaklyCompressible:
             value = getattr(self, name)
             if value is not None and value < 1:
                 raise ValueError(f"WeaklyCompressible.{name} must be at least 1 or None, got {value}")
+        self._check_combinations()
+
+    def _check_combinations(self) -> None:
+        """Refuse options that would be accepted and then ignored."""
+        if self.tensile is not None and not (self.tensile > 0 and self.pressure == "symmetric"):
+            raise ValueError(
+                "WeaklyCompressible.tensile must be positive and needs pressure='symmetric', got "
+                f"{self.tensile} with '{self.pressure}'"
+            )
+        if self.xsph is not None and self.xsph.level == "velocity" and self.order != "thesis":
+            raise ValueError(
+                f"XSPH of level 'velocity' belongs to order 'thesis', got order '{self.order}'; use level 'position'"
+            )
+        if self.shepard_period is not None and self.order not in ("thesis", "symplectic"):
+            raise ValueError(f"the Shepard filter needs order 'thesis' or 'symplectic', got '{self.order}'")
 
 
 # 16 particles per cell of table 4.1 put a spacing at cell / 16^(1/3); the support of the truncated Gaussian (delta 3)

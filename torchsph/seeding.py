@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -71,7 +72,7 @@ def seed_particles(simulator: Simulator, time: float, generator: torch.Generator
             f"no particle of spacing {simulator.scene.spacing:g} m fits inside the walls at {time:g} s; use a finer "
             "spacing"
         )
-    volume = simulator.scene.walls.volume(time) / simulator.scene.spacing**simulator.scene.dimension
+    volume = domain.fluid_volume(time) / simulator.scene.spacing**simulator.scene.dimension
     mass = torch.full_like(position[:, 0], volume / position.shape[0])
     return _resting(position, mass)
 
@@ -88,15 +89,21 @@ def _wall_box(simulator: Simulator, time: float) -> tuple[Tensor, Tensor]:
     return vertices.amin(0), vertices.amax(0)
 
 
+def _whole_periods(simulator: Simulator) -> list[int]:
+    """Lattice points along each periodic axis, 0 along the others; ValueError where they do not fit."""
+    counts = []
+    for length in [] if simulator.domain.period is None else simulator.domain.period.tolist():
+        counts.append(round(length) if math.isfinite(length) else 0)
+        if counts[-1] and abs(length - counts[-1]) > 1e-3 * length:
+            raise ValueError(f"a period of {length:g} spacings is not a whole number; change Scene.spacing")
+    return counts
+
+
 def _box_lattice(simulator: Simulator, seeding: Seeding, generator: torch.Generator) -> Tensor:
     period = simulator.domain.period
     if period is None or not bool(torch.isfinite(period).all()):
         raise ValueError("a scene without walls must be periodic in every direction to be seeded; else use resume()")
-    counts = [round(float(p)) for p in period]
-    for length, count in zip(period.tolist(), counts, strict=True):
-        if abs(length - count) > 1e-3 * length:
-            raise ValueError(f"a period of {length:g} spacings is not a whole number; change Scene.spacing")
-    position = _lattice(torch.zeros_like(period), counts)
+    position = _lattice(torch.zeros_like(period), _whole_periods(simulator))
     return position + seeding.jitter * (2 * _uniform(position, generator) - 1)
 
 
@@ -150,12 +157,16 @@ def _quiet(
 ) -> Tensor:
     """A lattice inside the walls, relaxed by shifting down the crowding gradient (Colagrossi et al. 2012)."""
     counts = (torch.ceil(upper - lower) + 1).to(torch.int64).tolist()
-    position = _lattice(lower - 0.25, counts)
+    origin = lower - 0.25
+    for axis, count in enumerate(_whole_periods(simulator)):
+        if count:
+            origin[axis], counts[axis] = 0.0, count
+    position = _lattice(origin, counts)
     position = position + seeding.jitter * (2 * _uniform(position, generator) - 1)
     position = position[domain_sample(simulator, position).distance > _CUT]
     if position.shape[0] == 0 or not isinstance(simulator.scheme.wall, CompleteKernelWall):
         return position
-    volume = simulator.scene.walls.volume(simulator.domain.middle) / simulator.scene.spacing ** position.shape[1]
+    volume = simulator.domain.fluid_volume(simulator.domain.middle) / simulator.scene.spacing ** position.shape[1]
     return relaxed(simulator, position, volume / position.shape[0], seeding.relaxations)
 
 

@@ -40,14 +40,18 @@ def step_limits(
 
 
 def shifting_displacement(
-    particles: Particles, concentration: Tensor, step: Tensor, smoothing_length: float, strength: float
+    particles: Particles, concentration: Tensor, step: Tensor, smoothing_length: float, strength: float,
+    largest: bool = False,
 ) -> Tensor:
     """Displacement -A h |v| dt grad C that evens out the particles (Lind et al. 2012, speed-limited form), (N, D).
 
     A floor on the speed keeps a resting fluid from freezing in disorder; a cap of a tenth of a spacing keeps the
-    shift below anything that the velocity would have to be corrected for.
+    shift below anything that the velocity would have to be corrected for. With ``largest`` the speed is the largest
+    of the member (Sun et al. 2017 eq. 14), so that stagnation points are evened out as well.
     """
     speed = particles.velocity.norm(dim=1).clamp_min(_SPEED_FLOOR)
+    if largest:
+        speed = particles.per_member(speed, "amax").index_select(0, particles.member)
     amount = strength * smoothing_length * speed * per_particle(step, particles.member)
     shift = -amount[:, None] * concentration
     length = shift.norm(dim=1, keepdim=True)
