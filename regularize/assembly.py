@@ -36,6 +36,14 @@ def reference_band(system: System, ordering: Ordering) -> torch.Tensor:
     return band
 
 
+def add_cell_rows(band: torch.Tensor, block: CellRows, components: int, ordering: Ordering) -> None:
+    """Add the rows of one cell block, whose cells all have the same Gram matrix."""
+    group = _CellGroups(block, components, ordering)
+    for start in range(0, len(ordering.keys), CELLS_PER_PASS):
+        part = slice(start, min(start + CELLS_PER_PASS, len(ordering.keys)))
+        _scatter(band, group.gram(part), components, ordering, part)
+
+
 def cell_gram(block: CellRows) -> torch.Tensor:
     """(L, C, L, C) normal matrix of one cell of a :class:`CellRows` block, float64, array order."""
     factor = block.factor.double()

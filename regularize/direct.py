@@ -7,7 +7,7 @@ import torch
 from scipy.linalg import LinAlgError, cho_solve_banded, cholesky_banded
 from scipy.linalg.blas import dtbmv, dtbsv
 
-from . import native
+from . import gram_triton, native
 from .assembly import reference_band
 from .banded import to_single
 from .block import BlockFactor
@@ -22,8 +22,8 @@ SHIFT = 1e-13  # of the largest diagonal entry; a few hundred times the rounding
 class PreparedSystem:
     """A system in solve order with its normal matrix and gradient, compiled or in torch.
 
-    Vectors are (active coefficients, C) in solve order. ``engine`` "native" or "reference"; None picks the
-    compiled one where it was built.
+    Vectors are (active coefficients, C) in solve order. ``engine`` "native" (compiled, CPU), "triton" (GPU)
+    or "reference" (torch, anywhere); None picks the fast one of the device where it is installed.
     """
 
     def __init__(self, system: System, ordering: Ordering | None = None, engine: str | None = None) -> None:
@@ -31,9 +31,17 @@ class PreparedSystem:
         self.ordering = order(system) if ordering is None else ordering
         if engine == "native" and not native.available():
             raise InvalidInput("engine is 'native' but no compiled library was built; use 'reference'")
-        on_cpu = self.ordering.nodes.device.type == "cpu"
-        self.engine = engine or ("native" if native.available() and on_cpu else "reference")
+        device = self.ordering.nodes.device
+        if engine == "triton" and not gram_triton.available(device):
+            raise InvalidInput(f"engine is 'triton', which cannot run on {device} here; use 'reference'")
+        self.engine = engine or self._fastest(device)
         self._packed = native.PackedSystem(system, self.ordering) if self.engine == "native" else None
+
+    @staticmethod
+    def _fastest(device: torch.device) -> str:
+        if device.type == "cpu":
+            return "native" if native.available() else "reference"
+        return "triton" if gram_triton.available(device) else "reference"
 
     def with_targets(self, system: System) -> "PreparedSystem":
         """The same rows in the same order with the right-hand sides of ``system``."""
@@ -46,7 +54,10 @@ class PreparedSystem:
 
     def band(self) -> torch.Tensor:
         """Lower band (unknowns, width) of the normal matrix, float64."""
-        return reference_band(self.system, self.ordering) if self._packed is None else self._packed.band()
+        if self._packed is not None:
+            return self._packed.band()
+        assemble = gram_triton.triton_band if self.engine == "triton" else reference_band
+        return assemble(self.system, self.ordering)
 
     def single_factor(self) -> "Factor | BlockFactor":
         """Cholesky factor in float32: half the time and memory; InvalidInput where it breaks down."""
