@@ -131,7 +131,7 @@ class _Cycle:
         self.replaced = 0
 
     def mask(self, frame: int) -> np.ndarray:
-        return np.asarray(self.measured.mask[frame], bool)
+        return np.array(self.measured.mask[frame], bool)
 
     def begin(self, smoothed: geometry.Recording) -> None:
         mask = self.mask(0)

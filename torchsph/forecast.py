@@ -172,7 +172,7 @@ def _from_one_start(
     totals: dict[str, float],
 ) -> None:
     began = clock.perf_counter()
-    velocity, mask = recording.velocity, np.asarray(recording.mask, bool)
+    velocity, mask = recording.velocity, np.array(recording.mask, bool)
     initial = np.where(mask[start], np.nan_to_num(velocity[start]), 0.0)
     known = torch.from_numpy(mask[start] & np.isfinite(velocity[start]).all(0))
     model.domain.prepare_until(float(recording.time[start]), float(recording.time[max(frames.values())]))

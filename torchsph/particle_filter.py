@@ -51,7 +51,7 @@ def filter_sph(
     fields, missing = [], []
     frames = tqdm(range(measured.frames), desc="sph", unit="frame", disable=None if progress else True)
     for frame in frames:
-        mask = torch.from_numpy(np.asarray(measured.mask[frame], bool)).to(model.device)
+        mask = torch.from_numpy(np.array(measured.mask[frame], bool)).to(model.device)
         if frame:
             run.advance(float(measured.time[frame]))
         background = run.fetch(measured.grid, mask)

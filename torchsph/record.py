@@ -23,7 +23,6 @@ class Record:
         inserted, removed: particles that entered and left, by valve: (members, valves).
         limited_by: how many steps each limit decided, (members, limits); names in ``terms.LIMITS``.
         searches: neighbour searches (all members together).
-        work: work of the pressure sources per unit mass density, J m^3/kg; zero without sources.
     """
 
     members: int
@@ -40,7 +39,6 @@ class Record:
     inserted: Tensor = field(init=False)
     removed: Tensor = field(init=False)
     limited_by: Tensor = field(init=False)
-    work: Tensor = field(init=False)
 
     def __post_init__(self) -> None:
         def counts(*shape: int) -> Tensor:
@@ -51,7 +49,7 @@ class Record:
         self.failed = torch.zeros(self.members, dtype=torch.bool, device=self.device)
         one = torch.ones(self.members, dtype=torch.float64, device=self.device)
         self.smallest_density, self.largest_density = one.clone(), one.clone()
-        self.largest_mach, self.work = torch.zeros_like(one), torch.zeros_like(one)
+        self.largest_mach = torch.zeros_like(one)
 
     def note_density(self, smallest: Tensor, largest: Tensor) -> None:
         """Widen the density range by deviations (members,) from the rest density."""
@@ -75,5 +73,4 @@ class Record:
             "largest_mach": self.largest_mach.tolist(), "outside": self.outside.tolist(),
             "crossed_wall": self.crossed_wall.tolist(), "inserted": self.inserted.tolist(),
             "removed": self.removed.tolist(), "limited_by": steps, "searches": self.searches,
-            "source_work": self.work.tolist(),
         }

@@ -129,6 +129,7 @@ class Simulation:
             self.time = stop
             self.particles = self.domain.finish(self.particles, self.record, stop)
             self._forget_pairs()
+        self.record.searches = self._stepper.pair_search.searches
         self.domain.account(self.particles, self.record, self.time)
 
     def _advance_interval(self, stop: float, longest: float) -> None:

@@ -18,7 +18,7 @@ CHOICE_EVERY = 3
 
 def node_weights(recording: geometry.Recording, frame: int) -> np.ndarray:
     """Confidence (*shape) of a frame's nodes: its weight, or one, inside the mask; 0 where the velocity is missing."""
-    mask = np.asarray(recording.mask[frame], bool)
+    mask = np.array(recording.mask[frame], bool)
     ones = mask.astype(np.float32)
     weight = ones if recording.weight is None else np.where(mask, recording.weight[frame], 0.0)
     return np.where(np.isfinite(recording.velocity[frame]).all(0), weight, 0.0)
@@ -74,7 +74,7 @@ class FrameSmoother:
         recording, dimension = self.recording, self.recording.dimension
         field = recording.velocity[frame] if velocity is None else velocity
         weight = node_weights(recording, frame) if weight is None else weight
-        mask = torch.from_numpy(np.asarray(recording.mask[frame], bool).reshape(-1))
+        mask = torch.from_numpy(np.array(recording.mask[frame], bool).reshape(-1))
         flat_weight = torch.from_numpy(np.asarray(weight, np.float64).reshape(-1))
         used = (flat_weight > 0) & mask
         if not bool(used.any()):
@@ -89,7 +89,7 @@ class FrameSmoother:
 
     def on_grid(self, fitted: regularize.SplineField, frame: int) -> np.ndarray:
         """The field at the nodes (D, *shape) float32, 0 outside the mask."""
-        grid, mask = self.recording.grid, np.asarray(self.recording.mask[frame], bool).reshape(-1)
+        grid, mask = self.recording.grid, np.array(self.recording.mask[frame], bool).reshape(-1)
         out = np.zeros((grid.dimension, grid.size), np.float32)
         out[:, mask] = fitted(self.nodes[torch.from_numpy(mask)], outside=0.0).T.numpy()
         return out.reshape(grid.dimension, *grid.shape)
