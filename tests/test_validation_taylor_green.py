@@ -33,15 +33,56 @@ def vortex(resolution, duration, **changes):
     return float((run.particles.velocity.double() - exact).norm() / exact.norm())
 
 
-def test_taylor_green_2d_after_half_a_unit_of_time():
-    """L2 error at Re 100 within 3.5 % at 25^2 and 2.2 % at 50^2 (measured 2.8 and 1.7 %).
+def test_taylor_green_2d_after_one_decay_time():
+    """L2 error at Re 100 within 7 % at 25^2 and 2.5 % at 50^2 (measured 5.5 and 1.8 %), order above 1.2 between.
 
-    The issue asks for 1 % at 100^2 after one decay time and order 1.5; the slow test below says what is reached.
+    The issue asks for 1 % at 100^2 and order 1.5 over all; the slow test says what is reached there.
     """
-    errors = [vortex(n, 0.5) for n in (25, 50)]
-    assert errors[0] < 0.035 and errors[1] < 0.022
+    errors = [vortex(n, DECAY_TIME) for n in (25, 50)]
+    assert errors[0] < 0.07 and errors[1] < 0.025
+    assert validation.observed_order([1 / 25, 1 / 50], errors) > 1.2
+
+
+@pytest.mark.slow
+def test_taylor_green_2d_at_100():
+    """Measured 1.27 % at 100^2, order 1.05 over 25^2 to 100^2: above the 1 % and below the 1.5 that were asked for.
+
+    With h / dx fixed the sums' own error does not fall with the spacing (Quinlan et al. 2006); amplitude, not
+    shape, is what is left (1.2 % too strong).
+    """
+    errors = [vortex(n, DECAY_TIME) for n in (25, 50, 100)]
+    assert errors[2] < 0.016
+    assert validation.observed_order([1 / 25, 1 / 50, 1 / 100], errors) > 0.9
 
 
 def test_the_speed_of_the_shifting_matters_at_stagnation_points():
-    """With the particle's own speed the lattice breaks up at stagnation points: ten times the error at 25^2."""
+    """With the particle's own speed the lattice breaks up where the fluid rests: over three times the error."""
     assert vortex(25, 0.5, shifting_speed="local", shifting=0.5) > 3 * vortex(25, 0.5)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("reynolds", "bound"), [(50, 0.03), (100, 0.03)])
+def test_taylor_green_3d_kinetic_energy(reynolds, bound):
+    """Kinetic energy until t = 5 against JAX-Fluids on 64^3 cells, at 32^3 particles, relative to its present value."""
+    file = EXPERIMENTS / f"tgv3d_Re{reynolds}.csv"
+    if not file.exists():
+        pytest.skip(f"{file} is not here")
+    rows = [row for row in csv.reader(file.open()) if row and not row[0].startswith("#")]
+    table = np.array(rows[1:], float)
+    side = 2 * math.pi
+    scene = Scene(spacing=side / 32, fluid=Fluid(1.0, 1 / reynolds), period=(side,) * 3)
+    scheme = preset("default", **(validation.PERIODIC_OPTIONS | {"smoothing_ratio": 1.6}))
+    run = Simulator(scene, scheme, seeding=Seeding(jitter=0.0)).start(0.0)
+    points = run.particles.position * scene.spacing
+    pressure = validation.taylor_green_3d_pressure(points)
+    run.particles = run.particles.changed(
+        velocity=validation.taylor_green_3d(points), deviation=pressure / scheme.sound_speed**2
+    )
+    worst = 0.0
+    for time in (1.0, 2.0, 3.0, 4.0, 5.0):
+        run.advance(time)
+        energy = float(run.particles.velocity.double().square().sum(1).mean()) / 2
+        expected = np.interp(time, table[:, 0], table[:, 2])
+        print(f"Re {reynolds} t {time}: {energy:.5f} against {expected:.5f}")
+        worst = max(worst, abs(energy / expected - 1))
+    assert worst < bound

@@ -1,0 +1,164 @@
+"""States that break simulators: tensile instability, coincident particles, vacuum, no viscosity, too long steps."""
+
+import math
+
+import pytest
+import torch
+
+from torchsph import Scene, Simulator, preset
+from torchsph.particles import Particles
+from torchsph.scene import Fluid
+from torchsph.terms import LIMITS
+from torchsph.validation import FREE_SURFACE_OPTIONS
+
+PRECISIONS = [torch.float32, torch.float64]
+BACKENDS = ["auto", "reference"]
+OPEN = Scene(spacing=0.02, fluid=Fluid(1000.0, 1.0), reference_speed=1.0, dimension=2)
+PERIODIC = Scene(spacing=1 / 20, fluid=Fluid(1.0, 0.01), period=(1.0, 1.0), reference_speed=1.0, dimension=2)
+
+
+def particles_at(position, velocity, deviation=None):
+    one = torch.ones_like(position[:, 0])
+    label = torch.zeros(len(position), dtype=torch.int64)
+    return Particles(position, velocity, 0 * one if deviation is None else deviation, one, label, label, 1)
+
+
+def lattice(count, dtype):
+    axis = torch.arange(count, dtype=dtype) + 0.5
+    return torch.cartesian_prod(axis, axis)
+
+
+def resumed(scene, particles, backend="auto", **changes):
+    options = {"sound_speed": 10.0} | changes
+    simulator = Simulator(scene, preset("default", **options), dtype=particles.position.dtype, backend=backend)
+    return simulator.resume(particles, 0.0)
+
+
+def energy(run):
+    return float((run.particles.mass * run.particles.velocity.square().sum(1)).sum()) / 2
+
+
+def healthy(run):
+    return not bool(run.record.failed.any()) and bool(torch.isfinite(run.particles.position).all())
+
+
+@pytest.mark.parametrize("dtype", PRECISIONS)
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_rotating_square_patch_keeps_its_density(dtype, backend):
+    """Colagrossi 2005: negative pressure inside tears untreated SPH apart; here until half a radian."""
+    count, omega = 16, 2.0
+    scene = OPEN
+    position = lattice(count, dtype)
+    arm = (position - count / 2) * scene.spacing
+    velocity = omega * torch.stack([arm[:, 1], -arm[:, 0]], 1)
+    run = resumed(scene, particles_at(position, velocity), backend, **FREE_SURFACE_OPTIONS)
+    before = energy(run)
+    run.advance(0.5 / omega)
+    assert healthy(run)
+    assert 0.99 < float(run.record.smallest_density) <= float(run.record.largest_density) < 1.01
+    assert 0.9 * before < energy(run) <= before
+    nearest = torch.cdist(run.particles.position, run.particles.position).fill_diagonal_(math.inf).amin(1)
+    assert 0.7 < float(nearest.min()) and float(nearest.max()) < 1.2  # neither clumps nor strays
+
+
+def test_the_switched_pressure_is_not_for_free_surfaces():
+    """What the options for free surfaces are for: the default's pressure form feeds energy into the same patch."""
+    position = lattice(16, torch.float64)
+    arm = (position - 8) * OPEN.spacing
+    start = particles_at(position, 2.0 * torch.stack([arm[:, 1], -arm[:, 0]], 1))
+    run = resumed(OPEN, start, **(FREE_SURFACE_OPTIONS | {"pressure": "switched"}))
+    before = energy(run)
+    run.advance(0.25)
+    assert energy(run) > 10 * before
+
+
+@pytest.mark.parametrize("dtype", PRECISIONS)
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("order", ["symplectic", "verlet", "predictor_corrector"])
+def test_two_particles_at_one_place_stay_finite(dtype, backend, order):
+    position = torch.cat([lattice(12, dtype), torch.full((1, 2), 6.5, dtype=dtype)])
+    generator = torch.Generator().manual_seed(0)
+    velocity = 0.1 * torch.randn(position.shape, generator=generator, dtype=dtype)
+    run = resumed(OPEN, particles_at(position, velocity), backend, order=order)
+    before = energy(run)
+    run.advance(0.01)
+    assert healthy(run) and energy(run) < 2 * before
+
+
+@pytest.mark.parametrize("dtype", PRECISIONS)
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_single_particle_flies_straight_and_falls(dtype, backend):
+    scene = Scene(spacing=0.02, gravity=(0.0, -9.81), dimension=2)
+    start = particles_at(torch.zeros(1, 2, dtype=dtype), torch.tensor([[1.0, 0.0]], dtype=dtype))
+    run = resumed(scene, start, backend, order="verlet")
+    run.advance(0.1)
+    expected = torch.tensor([0.1, -0.5 * 9.81 * 0.01], dtype=torch.float64)
+    torch.testing.assert_close(run.particles.position[0].double() * 0.02, expected, rtol=1e-5, atol=1e-7)
+
+
+@pytest.mark.parametrize("dtype", PRECISIONS)
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_front_that_leaves_a_vacuum_behind(dtype, backend):
+    """Half of a block flies away: a gap opens, momentum stands still, energy only falls."""
+    position = lattice(14, dtype)
+    right = position[:, 0] > 7
+    velocity = torch.zeros_like(position)
+    velocity[right, 0] = 2.0
+    run = resumed(OPEN, particles_at(position, velocity), backend, **FREE_SURFACE_OPTIONS)
+    before = energy(run)
+    run.advance(0.15)
+    p = run.particles
+    assert healthy(run) and energy(run) < before
+    assert float(p.position[right, 0].min() - p.position[~right, 0].max()) > 2.0  # spacings; they start one apart
+    assert float(p.velocity[right, 0].mean()) > 1.5
+    drift = p.velocity[:, 0].mean() - 1.0
+    assert abs(float(drift)) < (1e-5 if dtype == torch.float32 else 1e-12)
+
+
+@pytest.mark.parametrize("dtype", PRECISIONS)
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("speed", [0.5, 3.0])
+def test_zero_viscosity_and_mach_0_3(dtype, backend, speed):
+    """An inviscid vortex at Mach 0.05 and 0.3: no failure, no gain of energy."""
+    scene = Scene(spacing=1 / 20, fluid=Fluid(1.0, 0.0), period=(1.0, 1.0), reference_speed=speed, dimension=2)
+    position = lattice(20, dtype)
+    x, y = (2 * math.pi * position / 20).unbind(1)
+    velocity = torch.stack([-torch.cos(x) * torch.sin(y), torch.sin(x) * torch.cos(y)], 1)
+    run = resumed(scene, particles_at(position, velocity), backend)
+    before = energy(run)
+    run.advance(0.1 / speed)
+    assert healthy(run) and energy(run) < 1.01 * before
+    assert float(run.record.largest_mach) == pytest.approx(speed / 10, rel=0.15)
+
+
+def vortex(courant, dtype=torch.float32):
+    position = lattice(20, dtype)
+    x, y = (2 * math.pi * position / 20).unbind(1)
+    velocity = torch.stack([-torch.cos(x) * torch.sin(y), torch.sin(x) * torch.cos(y)], 1)
+    return resumed(PERIODIC, particles_at(position, velocity), courant=courant)
+
+
+def test_steps_never_exceed_the_limits_whatever_the_frames_ask_for():
+    """One step per frame is asked for; the acoustic limit courant h / (c + v) decides, and is counted as such."""
+    run = vortex(0.35)
+    run.advance(0.1)
+    limit = 0.35 * 1.3 / 20 / 10
+    assert int(run.record.steps) >= math.ceil(0.1 / limit)
+    assert int(run.record.limited_by[0, LIMITS.index("acoustic")]) > 0.9 * int(run.record.steps)
+
+
+@pytest.mark.parametrize("courant", [0.35, 1.05])
+def test_steps_at_and_three_times_above_the_limit(courant):
+    """At the limit the vortex decays; three times above it the run is either sound or flagged, never silently wrong."""
+    from torchsph import NumericalFailure
+
+    run = vortex(courant)
+    before = energy(run)
+    try:
+        run.advance(0.1)
+    except NumericalFailure:
+        assert courant > 0.35 and bool(run.record.failed.all())
+        return
+    sound = healthy(run) and energy(run) < before and float(run.record.largest_density) < 1.1
+    flagged = float(run.record.largest_density) > 1.1 or float(run.record.largest_mach) > 0.3
+    assert sound if courant == 0.35 else sound or flagged
