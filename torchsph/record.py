@@ -22,6 +22,8 @@ class Record:
         crossed_wall: how often a particle was found beyond the wall and put back.
         inserted, removed: particles that entered and left, by valve: (members, valves).
         limited_by: how many steps each limit decided, (members, limits); names in ``terms.LIMITS``.
+        reductions: how often a limit asked for a step shorter than the step before by more than a hundredth.
+        floored: steps that the scheme's floor kept longer than the limits asked for; such a run may be unstable.
         searches: neighbour searches (all members together).
     """
 
@@ -39,12 +41,15 @@ class Record:
     inserted: Tensor = field(init=False)
     removed: Tensor = field(init=False)
     limited_by: Tensor = field(init=False)
+    reductions: Tensor = field(init=False)
+    floored: Tensor = field(init=False)
 
     def __post_init__(self) -> None:
         def counts(*shape: int) -> Tensor:
             return torch.zeros((self.members, *shape), dtype=torch.int64, device=self.device)
 
         self.steps, self.outside, self.crossed_wall = counts(), counts(), counts()
+        self.reductions, self.floored = counts(), counts()
         self.inserted, self.removed, self.limited_by = counts(self.valves), counts(self.valves), counts(len(LIMITS))
         self.failed = torch.zeros(self.members, dtype=torch.bool, device=self.device)
         one = torch.ones(self.members, dtype=torch.float64, device=self.device)
@@ -73,4 +78,5 @@ class Record:
             "largest_mach": self.largest_mach.tolist(), "outside": self.outside.tolist(),
             "crossed_wall": self.crossed_wall.tolist(), "inserted": self.inserted.tolist(),
             "removed": self.removed.tolist(), "limited_by": steps, "searches": self.searches,
+            "reductions": self.reductions.tolist(), "floored": self.floored.tolist(),
         }

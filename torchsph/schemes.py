@@ -123,6 +123,8 @@ class WeaklyCompressible:
             "verlet" is the position Verlet scheme, "predictor_corrector" the symplectic predictor-corrector, both of
             second order (module ``second_order``).
         courant: fraction of the acoustic limit h / (c + v), of h^2/(8 nu) and of sqrt(h / |a|) / 2.
+        step_floor: no step is cut below this fraction of the acoustic limit of the fluid at rest, or None: a single
+            runaway particle then cannot stall a run; the record counts the steps that the floor held up.
         steps_per_frame: at least so many steps between imposed frames, or None.
     """
 
@@ -146,6 +148,7 @@ class WeaklyCompressible:
     valve: PressureSource | Reservoir | None = field(default_factory=Reservoir)
     order: str = "symplectic"
     courant: float = 0.35
+    step_floor: float | None = 0.02
     steps_per_frame: int | None = None
 
     def __post_init__(self) -> None:
@@ -167,6 +170,8 @@ class WeaklyCompressible:
             value = getattr(self, name)
             if value is not None and value < 1:
                 raise ValueError(f"WeaklyCompressible.{name} must be at least 1 or None, got {value}")
+        if self.step_floor is not None and not 0 < self.step_floor < 1:
+            raise ValueError(f"WeaklyCompressible.step_floor must lie in (0, 1) or be None, got {self.step_floor}")
         self._check_combinations()
 
     def _check_combinations(self) -> None:

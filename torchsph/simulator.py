@@ -107,6 +107,7 @@ class Simulation:
         self._stepper = Stepper(scheme, self._coefficients, search, scene.dimension)
         self._acceleration = torch.zeros_like(particles.position)
         self._steps = 0
+        self._last_limit = torch.zeros(particles.members, dtype=torch.float64, device=particles.position.device)
 
     @property
     def members(self) -> int:
@@ -161,16 +162,29 @@ class Simulation:
             speed, force, c.smoothing_length, c.sound_speed, c.viscosity or 0.0, self.simulator.scheme.courant
         ).double()
         frame = torch.full_like(limits[:1], longest)
-        smallest, which = torch.cat([limits, frame]).min(0)
+        active = left > 0
+        smallest, which = torch.cat([self._floored(limits, active), frame]).min(0)
+        self.record.reductions += active & (smallest < 0.99 * self._last_limit)
+        self._last_limit = torch.where(active, smallest, self._last_limit)
         steps = torch.ceil(left / smallest - 1e-9).clamp_min(1.0)
         even = torch.where(left > 0, left / steps, torch.zeros_like(left))
         which = torch.where(steps > 1, which, len(LIMITS) - 1)
-        active = (left > 0).to(torch.int64)
-        self.record.limited_by.scatter_add_(1, which[:, None], active[:, None])
+        self.record.limited_by.scatter_add_(1, which[:, None], active[:, None].to(torch.int64))
         self.record.steps += active
         mach = speed / c.sound_speed
         self.record.largest_mach = torch.maximum(self.record.largest_mach, mach.double())
         return even
+
+    def _floored(self, limits: Tensor, active: Tensor) -> Tensor:
+        """The limits (3, members), none below the scheme's floor; the record counts where that changed the step."""
+        scheme, c = self.simulator.scheme, self._coefficients
+        if scheme.step_floor is None:
+            return limits
+        floor = scheme.step_floor * scheme.courant * c.smoothing_length / c.sound_speed
+        # the viscous limit is known beforehand and no accident: it stays
+        held = (limits[[0, 2]] < floor).any(0) & (limits[1] > floor)
+        self.record.floored += active & held
+        return torch.stack([limits[0].clamp_min(floor), limits[1], limits[2].clamp_min(floor)])
 
     def _take_step(self, step: Tensor) -> None:
         before = self.particles
