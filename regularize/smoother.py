@@ -36,7 +36,8 @@ from .search import choose
 from .sparse import sparse_operators
 from .walls import WallRows
 
-SOLVERS = ("auto", "direct", "lsqr", "lsmr", "pcg")
+SOLVERS = ("auto", "direct", "direct32", "lsqr", "lsmr", "pcg")
+WITHOUT_FACTOR = ("direct32", "lsqr", "lsmr")  # none in float64 that an uncertainty could rest on
 NEIGHBOUR_ITERATIONS = 25  # about what a factorisation costs
 SCALINGS = ("density", "thesis")
 AUTOMATIC = (None, "likelihood", "gcv")
@@ -56,7 +57,8 @@ class Smoother:
     or samples of no flow, leave nothing to choose from (``field.choice`` is None there). ``robust``: "tukey"
     or "huber" reweighting of outliers, found together with that choice.
     ``search_knots``: the choice is made on a grid this many times coarser, in at most ``rounds`` rounds.
-    ``solver``: "direct" (what "auto" picks), "lsqr", "lsmr", or "pcg" with a neighbouring frame's factor;
+    ``solver``: "direct" (what "auto" picks), "direct32" (a float32 factor, refined to the tolerance: half the
+    time on large grids), "lsqr", "lsmr", or "pcg" with a neighbouring frame's factor;
     ``sparse``: the iterative ones store the matrix and its transpose instead of applying rows.
     ``tolerance``: true relative gradient at which a solver may stop; NotConverged otherwise.
     """
@@ -178,10 +180,10 @@ class Smoother:
         if self.solver == "pcg" and neighbour is not None:
             solution, factor = self._with_neighbour(problem.system, neighbour)
             return problem.field(solution, factor, own_factor=False)
-        if self.solver in ("lsqr", "lsmr"):
+        if self.solver in WITHOUT_FACTOR:
             if uncertainty:
                 raise InvalidInput(f"solver {self.solver!r} keeps no factor for uncertainty: use 'direct'")
-            return problem.field(self._iterate(problem.system))
+            return problem.field(self._without_factor(problem.system))
         solve = solve_with_gradient if traced else solve_direct
         solution, factor = solve(problem.system, tolerance=self.tolerance)
         return problem.field(solution, factor if uncertainty or self.solver == "pcg" else None)
@@ -236,7 +238,9 @@ class Smoother:
         data = data.reweighed(choice)
         return Problem(data, build_system(options, knots, data), choice)
 
-    def _iterate(self, system: System) -> Solution:
+    def _without_factor(self, system: System) -> Solution:
+        if self.solver == "direct32":
+            return solve_direct(system, tolerance=self.tolerance, single=True)[0]
         method = lsqr if self.solver == "lsqr" else lsmr
         apply = sparse_operators(system) if self.sparse else (system.matvec, system.rmatvec)
         options = {"tolerance": self.tolerance, "max_iterations": self.max_iterations}

@@ -92,3 +92,13 @@ def test_another_frames_choice_is_taken_over_but_outliers_are_judged_anew():
     assert second.choice.noise == first.choice.noise and second.choice.curvature == first.choice.curvature
     assert float(second.choice.robust[5]) == 0 and float(first.choice.robust[5]) > 0
     assert float((second(points) - velocity).square().mean().sqrt()) < 0.06
+
+
+def test_float32_factor_gives_the_direct_field():
+    points, velocity, weight = frame(0)
+    direct = OPTIONS.fit(points, velocity, weight)
+    single = OPTIONS.fixed(solver="direct32", tolerance=1e-9).fit(points, velocity, weight)
+    assert single.solution.gradient <= 1e-9 and single.solution.gradient != direct.solution.gradient
+    assert torch.allclose(single.coefficients, direct.coefficients, atol=1e-5)
+    with pytest.raises(InvalidInput, match="uncertainty"):
+        OPTIONS.fixed(solver="direct32").fit(points, velocity, weight, uncertainty=True)
