@@ -57,3 +57,27 @@ def test_options_that_would_be_ignored_are_refused():
         preset("default", xsph=XSPH(0.2, "velocity"), order="verlet")
     with pytest.raises(ValueError, match="Shepard filter needs order"):
         preset("default", shepard_period=20, order="verlet")
+
+
+def test_the_softening_of_the_viscous_term_is_compensated():
+    """Over a lattice with a wide kernel the term acts on a shear wave as nu k^2 with the share divided out, 0.6 %."""
+    from torchsph.pairs import MomentumTerms, PairState, Support, backend
+    from torchsph.smoothing import kernel
+    from torchsph.terms import softened_share
+
+    axis = torch.arange(96, dtype=torch.float64) + 0.5
+    place = torch.cartesian_prod(axis, axis[:16])
+    place[:, 1] = place[:, 1] - 8
+    wave = 2 * math.pi / 96
+    velocity = torch.stack([0 * place[:, 0], torch.sin(wave * place[:, 0])], 1)
+    one, label = torch.ones(len(place), dtype=torch.float64), torch.zeros(len(place), dtype=torch.int64)
+    support = Support(kernel("wendland_c2"), 2.0, 2)
+    engine = backend("reference")
+    period = torch.tensor([96.0, 16.0], dtype=torch.float64)
+    pairs = engine.search(place, label, support.radius, period=period)
+    state = PairState(place, velocity, one, 0 * one, 0 * one, label)
+    force = engine.momentum(pairs, state, support, MomentumTerms(None, laminar=1.0))[:, 1]
+    acting = -float((force * velocity[:, 1]).sum() / velocity[:, 1].square().sum()) / wave**2
+    share = softened_share(support.kernel, 2)
+    assert acting < 0.99  # what the compensation is for
+    assert acting / share == pytest.approx(1.0, abs=0.006)

@@ -13,7 +13,7 @@ from .particles import Particles
 from .schemes import CompleteKernelWall, PotentialWall, WeaklyCompressible
 from .second_order import predictor_corrector_step, verlet_step
 from .smoothing import kernel
-from .terms import shifting_displacement, tait_pressure
+from .terms import shifting_displacement, softened_share, tait_pressure
 from .walls import WallSample, friction, potential_force, retardation, wall_pressure_force
 
 # a particle whose kernel lies almost wholly behind walls would divide by nothing
@@ -97,8 +97,11 @@ class Stepper:
         velocity_xsph = scheme.xsph is not None and scheme.xsph.level == "velocity"
         self.velocity_xsph = scheme.xsph.epsilon if velocity_xsph else None
         self.position_xsph = scheme.xsph.epsilon if scheme.xsph is not None and not velocity_xsph else None
+        laminar = coefficients.viscosity
+        if laminar is not None:
+            laminar = laminar / softened_share(self.support.kernel, dimension)
         self.momentum_terms = MomentumTerms(
-            pressure=scheme.pressure, artificial=coefficients.artificial, laminar=coefficients.viscosity,
+            pressure=scheme.pressure, artificial=coefficients.artificial, laminar=laminar,
             tensile=scheme.tensile,
         )
         self._rate_terms = RateTerms(

@@ -81,7 +81,7 @@ def observed_order(spacings: list[float], errors: list[float]) -> float:
 
 
 # Changes of the default preset for flows it was not chosen for, each measured in tests/test_validation_*.py or
-# tests/test_simulator_hard_cases.py. Vortices: after one decay time at 50^2 the Taylor-Green error is 2 % (76 %
+# tests/test_simulator_hard_cases.py. Vortices: after one decay time at 50^2 the Taylor-Green error is 3 % (60 %
 # with the default: its shifting leaves stagnation points alone, and its kernel sees 21 neighbours in a plane).
 PERIODIC_OPTIONS = {
     "smoothing_ratio": 2.0, "sound_speed": 10.0, "pressure": "sum", "artificial_viscosity": None,
