@@ -18,8 +18,9 @@ ALLOWED = {
 # What pyproject.toml declares; `triton` comes with torch's CUDA builds and is asked for where it is used.
 THIRD_PARTY = {
     "geometry": {"numpy", "scipy", "trimesh", "h5py", "torch"},
-    "regularize": {"numpy", "scipy", "torch"},
-    "torchsph": {"numpy", "scipy", "trimesh", "h5py", "torch", "tqdm", "matplotlib", "triton"},
+    # triton comes with torch's CUDA builds; pyuff_ustb is the extra `uff`; both are imported where they are used
+    "regularize": {"numpy", "scipy", "torch", "triton"},
+    "torchsph": {"numpy", "scipy", "trimesh", "h5py", "torch", "tqdm", "matplotlib", "triton", "pyuff_ustb"},
 }
 SIMULATOR = (
     "simulator",
