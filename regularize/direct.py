@@ -60,7 +60,8 @@ class PreparedSystem:
         return assemble(self.system, self.ordering)
 
     def single_factor(self) -> "Factor | BlockFactor":
-        """Cholesky factor in float32: half the time and memory; InvalidInput where it breaks down."""
+        """Cholesky factor in float32, in half the time (the peak of memory is that of the float64 band); InvalidInput where
+        it breaks down."""
         if self.ordering.nodes.device.type == "cpu":
             return Factor(to_single(self.band()), self.ordering)
         return BlockFactor(self.band().float(), self.ordering)
