@@ -60,8 +60,10 @@ class PreparedSystem:
         return assemble(self.system, self.ordering)
 
     def single_factor(self) -> "Factor | BlockFactor":
-        """Cholesky factor in float32, in half the time (the peak of memory is that of the float64 band); InvalidInput where
-        it breaks down."""
+        """Cholesky factor in float32, in half the time; InvalidInput where it breaks down.
+
+        The peak of memory is that of the float64 band, in whose place it is made.
+        """
         if self.ordering.nodes.device.type == "cpu":
             return Factor(to_single(self.band()), self.ordering)
         return BlockFactor(self.band().float(), self.ordering)

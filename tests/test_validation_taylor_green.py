@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
 from torchsph import Scene, Seeding, Simulator, preset, validation
 from torchsph.scene import Fluid

@@ -51,7 +51,9 @@ class ObservationError:
         return self.deviation[frame].reshape(shape) ** 2 * factor
 
 
-def estimate_error(measured: geometry.Recording, splines: FrameSmoother, smoothed: geometry.Recording) -> ObservationError:
+def estimate_error(
+    measured: geometry.Recording, splines: FrameSmoother, smoothed: geometry.Recording
+) -> ObservationError:
     """The error model of a measurement from what its splines leave over, frame by frame.
 
     The deviation of each component is a robust one (median absolute residual), so that outliers do not widen it. The

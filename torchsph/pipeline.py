@@ -70,7 +70,8 @@ def run_methods(
         spacing = ANALYSIS_SPACING * min(measured.grid.spacing)
     model = make_model(measured, preset=preset, spacing=spacing, device=device)
     if "sph" in methods:
-        run = filter_sph(measured, model, error=estimate_error(measured, splines, smoothed), seed=seed, progress=progress)
+        error = estimate_error(measured, splines, smoothed)
+        run = filter_sph(measured, model, error=error, seed=seed, progress=progress)
         results["sph"] = MethodResult(run.recording, clock.perf_counter() - began, run.info)
         began = clock.perf_counter()
     if "ensemble" in methods:

@@ -42,7 +42,7 @@ class FrameSmoother:
         self._choices: dict[int, regularize.Choice | None] = {}
 
     def choice(self, frame: int) -> regularize.Choice | None:
-        """What was chosen for a frame: that of the middle frame of its group; None for a smoother with fixed options."""
+        """What was chosen for the middle frame of the frame's group; None for a smoother with fixed options."""
         if not self.smoother.automatic:
             return None
         group = frame // self.choose_every
