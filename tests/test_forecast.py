@@ -50,7 +50,7 @@ def test_a_steady_vortex_stays(recording, model):
 def test_no_lead_gives_back_the_start_when_the_lost_detail_is_added(recording, model):
     mask = torch.from_numpy(np.ascontiguousarray(recording.mask[0]))
     start = torch.from_numpy(recording.velocity[0])
-    going = GridForecast(model, recording.grid, start, mask, 0.0, Transfer(detail="static"))
+    going = GridForecast(model, recording.grid, start, mask, 0.0, Transfer())
     value, covered = going.at(0.0, mask)
     assert covered[0][mask].all()
     torch.testing.assert_close(value[0][:, mask], start[:, mask], atol=1e-6, rtol=0)
@@ -72,5 +72,3 @@ def test_a_lead_that_no_frame_has_is_refused(recording, model):
 def test_options_are_checked():
     with pytest.raises(ValueError, match="Transfer.fade"):
         Transfer(fade=0.0)
-    with pytest.raises(ValueError, match="Transfer.detail"):
-        Transfer(detail="magic")

@@ -46,7 +46,7 @@ class EnsembleOptions:
     spline_share: float = 0.5
     choose_every: int = 3
     memory: float = 5.0
-    transfer: Transfer = Transfer(detail="static")
+    transfer: Transfer = Transfer()
 
     def __post_init__(self) -> None:
         for name in ("initial_spread", "length", "localisation", "memory"):

@@ -29,17 +29,13 @@ class Transfer:
         fade: time (s) over which the correction below fades, or None for the plain fetch. Imposing and fetching
             loses detail that the particles cannot carry; the forecast is the fetched field plus that loss (initial
             grid minus the field fetched at once), times exp(-lead / fade). For noisy input use None: the loss is noise.
-        detail: whether the lost detail travels with the particles ("advected") or stays where it was ("static").
     """
 
     fade: float | None = 0.015
-    detail: str = "advected"
 
     def __post_init__(self) -> None:
         if self.fade is not None and not self.fade > 0:
             raise ValueError(f"Transfer.fade must be positive (s) or None, got {self.fade}")
-        if self.detail not in ("advected", "static"):
-            raise ValueError(f"Transfer.detail must be 'advected' or 'static', got '{self.detail}'")
 
 
 class GridForecast:
@@ -63,8 +59,6 @@ class GridForecast:
             kept = self.run.fetch(grid, mask)
             known = mask & kept.covered
             self._lost = torch.where(known[:, None], batched.to(kept.value) - kept.value, torch.zeros_like(kept.value))
-            if transfer.detail == "advected":
-                self.run.mark_origins()
 
     def at(self, time: float, mask: Tensor) -> tuple[Tensor, Tensor]:
         """Advance to ``time`` (s) and fetch at the nodes of ``mask``.
@@ -76,11 +70,7 @@ class GridForecast:
         if self._lost is None:
             return found.value, found.covered
         share = math.exp(-(time - self.start_time) / self.transfer.fade)
-        detail = self._lost
-        if self.transfer.detail == "advected":
-            origin = self.run.fetch_origins(self.grid, mask).flatten(2).transpose(1, 2)
-            detail = self.grid.sample(self._lost, origin, outside="zero").reshape(self._lost.shape)
-        return found.value + share * detail * found.covered[:, None], found.covered
+        return found.value + share * self._lost * found.covered[:, None], found.covered
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,6 @@ class Particles:
         member: (N,) int64, 0 <= member < members.
         kind: (N,) int64, FLUID, or RESERVOIR + v for a particle of the buffer of valve v.
         members: B.
-        origin: (N, D) where the particles were when they were marked, or None (nobody asked to know).
     """
 
     position: Tensor
@@ -33,7 +32,6 @@ class Particles:
     member: Tensor
     kind: Tensor
     members: int
-    origin: Tensor | None = None
 
     @property
     def count(self) -> int:
@@ -56,27 +54,20 @@ class Particles:
 
     def select(self, keep: Tensor) -> Particles:
         """The particles where ``keep`` (N,) bool, or the indices in ``keep``."""
-        return replace(self, **{name: value[keep] for name, value in self._arrays().items()})
+        return replace(self, **{name: getattr(self, name)[keep] for name in _ARRAYS})
 
     def joined(self, other: Particles) -> Particles:
         """These particles followed by those of ``other``."""
-        return replace(self, **{n: torch.cat([value, other._array(n)]) for n, value in self._arrays().items()})
+        return replace(self, **{n: torch.cat([getattr(self, n), getattr(other, n)]) for n in _ARRAYS})
 
     def repeated(self, members: int) -> Particles:
         """``members`` copies of a single member, one after the other."""
         if self.members != 1:
             raise ValueError(f"only a single member can be repeated, this set has {self.members}")
-        copies = {n: value.repeat((members,) + (1,) * (value.ndim - 1)) for n, value in self._arrays().items()}
+        arrays = {name: getattr(self, name) for name in _ARRAYS}
+        copies = {n: value.repeat((members,) + (1,) * (value.ndim - 1)) for n, value in arrays.items()}
         member = torch.arange(members, device=self.member.device).repeat_interleave(self.count)
         return Particles(**{**copies, "member": member}, members=members)
-
-    def _arrays(self) -> dict[str, Tensor]:
-        return {n: getattr(self, n) for n in _ARRAYS if getattr(self, n) is not None}
-
-    def _array(self, name: str) -> Tensor:
-        """An array; particles that join a marked set were first seen where they are now."""
-        value = getattr(self, name)
-        return self.position if value is None and name == "origin" else value
 
     def state(self, pressure: Tensor) -> PairState:
         """What the pair passes read, with the pressure (N,) that belongs to it."""

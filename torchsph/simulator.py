@@ -253,17 +253,6 @@ class Simulation:
         self.particles = self.particles.changed(velocity=self.particles.velocity + change)
         return float(change.square().sum(1).mean().sqrt()) * self.units.speed
 
-    def mark_origins(self) -> None:
-        """Remember where every particle is now."""
-        self.particles = self.particles.changed(origin=self.particles.position)
-
-    def fetch_origins(self, grid: Grid, mask: Tensor) -> Tensor:
-        """Where the fluid at the nodes of ``mask`` was when it was marked, m: (members, D, *shape)."""
-        p = self.particles
-        moved = self._fetched(grid, mask, (p.position - p.origin) * self.units.length).value
-        nodes = grid.nodes(dtype=torch.float64, device=moved.device).T.reshape(1, grid.dimension, *grid.shape)
-        return nodes.to(moved.dtype) - moved
-
     def fetch(self, grid: Grid, mask: Tensor) -> Fetched:
         """Velocities at the nodes where ``mask`` (*shape): value (members, D, *shape), covered (members, *shape)."""
         return self._fetched(grid, mask, self.particles.velocity * self.units.speed)
