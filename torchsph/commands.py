@@ -19,6 +19,7 @@ from torchsph import data, metrics, pipeline, report
 from torchsph._version import __version__
 from torchsph.arguments import LEADS
 from torchsph.outputs import output_folder, staged, write_json
+from torchsph.smooth import smooth as smooth_recording
 
 __all__ = ["COMMANDS"]
 
@@ -178,7 +179,7 @@ def smooth(args: argparse.Namespace) -> None:
     """`torchsph smooth`: a B-spline field for each frame."""
     path = _output_file(args.out)
     measured = _full_vectors(geometry.read_recording(args.measurement), args.measurement)
-    smoothed = pipeline.smooth(measured, progress=True)
+    smoothed = smooth_recording(measured, progress=True)
     geometry.write_recording(path, smoothed)
     scores = {
         name: metrics.evaluate(one, None, measured) for name, one in (("raw", measured), ("spline", smoothed))
