@@ -48,7 +48,7 @@ def test_a_steady_vortex_stays(recording, model):
 
 
 def test_no_lead_gives_back_the_start_when_the_lost_detail_is_added(recording, model):
-    mask = torch.from_numpy(np.ascontiguousarray(recording.mask[0]))
+    mask = torch.from_numpy(np.array(recording.mask[0]))
     start = torch.from_numpy(recording.velocity[0])
     going = GridForecast(model, recording.grid, start, mask, 0.0, Transfer())
     value, covered = going.at(0.0, mask)
