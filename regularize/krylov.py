@@ -149,5 +149,5 @@ def _bidiagonalise(
 
 
 def norm_of(u: torch.Tensor, low: torch.Tensor) -> float:
-    # hypot of the two parts, accumulated in float64 whatever the iteration's precision
+    """Norm of the stacked vector (u, low): the two parts' hypotenuse, summed in float64 whatever their precision."""
     return float((u.double().square().sum() + low.double().square().sum()).sqrt())

@@ -123,7 +123,8 @@ class Domain:
 
     def prepare_until(self, start: float, stop: float) -> None:
         """Make the wall fields of a stretch of time (s) beforehand, so that the steps find them."""
-        for early, late in zip([start, *self.breaks(start, stop)], self.breaks(start, stop), strict=False):
+        ends = self.breaks(start, stop)
+        for early, late in zip([start, *ends], ends, strict=False):
             self.enter(early, late)
 
     @property

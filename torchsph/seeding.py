@@ -13,7 +13,7 @@ from .pairs.interface import PairState, RateTerms, Support
 from .particles import FLUID, Particles
 from .schemes import CompleteKernelWall, PotentialWall
 from .smoothing import kernel
-from .walls import WallSample, potential
+from .walls import potential
 
 if TYPE_CHECKING:
     from .simulator import Simulator
@@ -132,24 +132,19 @@ def _boltzmann(
     counts = (torch.ceil(upper) - origin).to(torch.int64).tolist()
     corner = _lattice(origin, counts) - 0.5
     # a vectorised sweep over cells, repeated where the try was refused, keeps about one particle per cell
-    wall = domain_sample(simulator, corner + 0.5)
+    wall = simulator.domain.sample_at(corner + 0.5)
     open_cells = torch.nonzero(wall.distance > 0).squeeze(1)
     chosen = []
     for _ in range(_TRIES):
         if open_cells.numel() == 0:
             break
         trial = corner[open_cells] + _uniform(corner[open_cells], generator)
-        wall = domain_sample(simulator, trial)
+        wall = simulator.domain.sample_at(trial)
         chance = torch.exp(-potential(model, sound, wall) / scale) * (wall.distance > 0)
         taken = torch.rand(chance.shape, generator=generator, dtype=chance.dtype, device=chance.device) < chance
         chosen.append(trial[taken])
         open_cells = open_cells[~taken]
     return torch.cat(chosen) if chosen else corner[:0]
-
-
-def domain_sample(simulator: Simulator, position: Tensor) -> WallSample:
-    """Walls at points (n, D), internal, at the time the domain has entered."""
-    return simulator.domain.sample_at(position)
 
 
 def _quiet(
@@ -163,7 +158,7 @@ def _quiet(
             origin[axis], counts[axis] = 0.0, count
     position = _lattice(origin, counts)
     position = position + seeding.jitter * (2 * _uniform(position, generator) - 1)
-    position = position[domain_sample(simulator, position).distance > _CUT]
+    position = position[simulator.domain.sample_at(position).distance > _CUT]
     if position.shape[0] == 0 or not isinstance(simulator.scheme.wall, CompleteKernelWall):
         return position
     volume = simulator.domain.fluid_volume(simulator.domain.middle) / simulator.scene.spacing ** position.shape[1]
@@ -185,10 +180,10 @@ def relaxed(simulator: Simulator, position: Tensor, mass: float, sweeps: int) ->
         state: PairState = particles.state(particles.deviation)
         terms = RateTerms(continuity=None, concentration=True)
         crowding = search.backend.rates(search.at(particles), state, support, terms).concentration
-        wall = domain_sample(simulator, position)
+        wall = simulator.domain.sample_at(position)
         move = -0.15 * scheme.smoothing_ratio**2 * (crowding - wall.share_gradient)
         length = move.norm(dim=1, keepdim=True)
         position = position + move * (_LARGEST_MOVE / length.clamp_min(_LARGEST_MOVE))
-        wall = domain_sample(simulator, position)
+        wall = simulator.domain.sample_at(position)
         position = position + (_CLEARANCE - wall.distance).clamp_min(0.0)[:, None] * wall.normal
     return position

@@ -244,15 +244,6 @@ class Simulation:
         moved = pulled(points, p.velocity * self.units.speed, grid, target, gain, weight) / self.units.speed
         self.particles = p.changed(velocity=torch.where(p.fluid[:, None], moved, p.velocity))
 
-    def nudge(self, grid: Grid, increment: Tensor, mask: Tensor) -> float:
-        """Add an increment given on a grid to the particles' velocities; returns the RMS it changed them by, m/s.
-
-        ``increment``: (members, D, *shape) or (D, *shape), m/s; it fades to nothing outside ``mask``.
-        """
-        change = self.domain.sampled(self.particles, grid, increment * mask)
-        self.particles = self.particles.changed(velocity=self.particles.velocity + change)
-        return float(change.square().sum(1).mean().sqrt()) * self.units.speed
-
     def fetch(self, grid: Grid, mask: Tensor) -> Fetched:
         """Velocities at the nodes where ``mask`` (*shape): value (members, D, *shape), covered (members, *shape)."""
         return self._fetched(grid, mask, self.particles.velocity * self.units.speed)
