@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import os
+import subprocess
+import sys
 
 import pytest
 import torch
@@ -92,6 +95,20 @@ class TestOperators:
             operators.pair_pass(
                 lists, [float("inf")] * 3, [terms, 0, 0, 0], [2.0, 0.4], coefficients, *arrays
             )
+
+
+@needs_cpu
+def test_first_search_does_not_wait_for_the_compiler_of_torch():
+    """Calling an operator must not import torch._dynamo, which takes seconds."""
+    lines = (
+        "import sys, torch",
+        "from torchsph.pairs import backend",
+        "x = torch.rand(50, 3)",
+        "backend('cpu').search(x, torch.zeros(50, dtype=torch.int64), 0.3)",
+        "sys.exit('torch._dynamo' in sys.modules)",
+    )
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    assert subprocess.run([sys.executable, "-c", "; ".join(lines)], env=environment, check=False).returncode == 0
 
 
 @needs_cpu

@@ -7,7 +7,8 @@ nothing here knows what the sums mean.
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -17,6 +18,23 @@ from .native import InterpolationArguments, ListArguments, PassArguments, Search
 
 CLUSTER = 8
 _REALS = {torch.float32: "f32", torch.float64: "f64"}
+_OPERATORS = torch.library.Library("torchsph", "FRAGMENT")
+
+
+def _operator(fake: Callable[..., Any], mutates: Sequence[str] = ()) -> Callable[[Callable[..., Any]], Any]:
+    """Make a function of CPU tensors a torch operator; ``fake`` gives its shapes, ``mutates`` what it writes into.
+
+    ``torch.library.custom_op`` would do the same, but its first call imports the compiler of torch, 2 s and more.
+    """
+
+    def register(function: Callable[..., Any]) -> Any:
+        name = function.__name__
+        _OPERATORS.define(name + torch.library.infer_schema(function, mutates_args=mutates))
+        _OPERATORS.impl(name, function, "CPU")
+        torch.library.register_fake(f"torchsph::{name}", fake, lib=_OPERATORS)
+        return getattr(torch.ops.torchsph, name).default
+
+    return register
 
 
 def _address(tensor: Tensor | None) -> int | None:
@@ -27,7 +45,18 @@ def _period(period: Sequence[float]) -> ctypes.Array:
     return (ctypes.c_double * 3)(*period, *(float("inf"),) * (3 - len(period)))
 
 
-@torch.library.custom_op("torchsph::cluster_lists", mutates_args=("entries",), device_types="cpu")
+def _cluster_lists_shapes(
+    position: Tensor, member: Tensor, radius: float, period: Sequence[float], entries: Tensor
+) -> list[Tensor]:
+    clusters = torch.library.get_ctx().new_dynamic_size()
+    slot, owner = (position.new_empty(size, dtype=torch.int32) for size in (CLUSTER * clusters, clusters))
+    offset, needed = (position.new_empty(size, dtype=torch.int64) for size in (clusters, 1))
+    periodic = any(length != float("inf") for length in period)
+    home = position.new_empty((CLUSTER * clusters if periodic else 0, position.shape[1]))
+    return [slot, owner, offset, home, needed]
+
+
+@_operator(_cluster_lists_shapes, mutates=("entries",))
 def cluster_lists(
     position: Tensor, member: Tensor, radius: float, period: Sequence[float], entries: Tensor
 ) -> list[Tensor]:
@@ -61,18 +90,6 @@ def cluster_lists(
     return [slot, owner, offset, home, needed]
 
 
-@cluster_lists.register_fake
-def _(
-    position: Tensor, member: Tensor, radius: float, period: Sequence[float], entries: Tensor
-) -> list[Tensor]:
-    clusters = torch.library.get_ctx().new_dynamic_size()
-    slot, owner = (position.new_empty(size, dtype=torch.int32) for size in (CLUSTER * clusters, clusters))
-    offset, needed = (position.new_empty(size, dtype=torch.int64) for size in (clusters, 1))
-    periodic = any(length != float("inf") for length in period)
-    home = position.new_empty((CLUSTER * clusters if periodic else 0, position.shape[1]))
-    return [slot, owner, offset, home, needed]
-
-
 def _search_arguments(
     position: Tensor, member: Tensor, radius: float, period: Sequence[float]
 ) -> SearchArguments:
@@ -87,7 +104,25 @@ def _search_arguments(
     )
 
 
-@torch.library.custom_op("torchsph::pair_pass", mutates_args=(), device_types="cpu")
+def _pair_pass_shapes(
+    lists: Sequence[Tensor],
+    period: Sequence[float],
+    choice: Sequence[int],
+    kernel: Sequence[float],
+    coefficients: Tensor,
+    position: Tensor,
+    velocity: Tensor,
+    mass: Tensor,
+    deviation: Tensor,
+    pressure: Tensor | None,
+    slope: Tensor | None,
+    field: Tensor | None,
+    active: Tensor | None,
+) -> list[Tensor]:
+    return plan.allocate(choice[0], position)
+
+
+@_operator(_pair_pass_shapes)
 def pair_pass(
     lists: Sequence[Tensor],
     period: Sequence[float],
@@ -150,26 +185,22 @@ def pair_pass(
     return outputs
 
 
-@pair_pass.register_fake
-def _(
-    lists: Sequence[Tensor],
-    period: Sequence[float],
-    choice: Sequence[int],
-    kernel: Sequence[float],
-    coefficients: Tensor,
+def _interpolation_moments_shapes(
     position: Tensor,
-    velocity: Tensor,
-    mass: Tensor,
-    deviation: Tensor,
-    pressure: Tensor | None,
-    slope: Tensor | None,
-    field: Tensor | None,
-    active: Tensor | None,
+    member: Tensor,
+    fields: Tensor,
+    query: Tensor,
+    query_member: Tensor,
+    radius: float,
+    period: Sequence[float],
+    kind: int,
+    kernel: Sequence[float],
+    lengths: Tensor,
 ) -> list[Tensor]:
-    return plan.allocate(choice[0], position)
+    return _allocate_moments(fields, query)
 
 
-@torch.library.custom_op("torchsph::interpolation_moments", mutates_args=(), device_types="cpu")
+@_operator(_interpolation_moments_shapes)
 def interpolation_moments(
     position: Tensor,
     member: Tensor,
@@ -208,22 +239,6 @@ def interpolation_moments(
             f"{unusable} particle or query positions are not finite, or their member does not exist"
         )
     return outputs
-
-
-@interpolation_moments.register_fake
-def _(
-    position: Tensor,
-    member: Tensor,
-    fields: Tensor,
-    query: Tensor,
-    query_member: Tensor,
-    radius: float,
-    period: Sequence[float],
-    kind: int,
-    kernel: Sequence[float],
-    lengths: Tensor,
-) -> list[Tensor]:
-    return _allocate_moments(fields, query)
 
 
 def _allocate_moments(fields: Tensor, query: Tensor) -> list[Tensor]:
