@@ -41,12 +41,12 @@ def channel_error(flow, across, times, **changes):
     return errors
 
 
-@pytest.mark.parametrize(("flow", "bound"), [("poiseuille", 0.009), ("couette", 0.013)])
+@pytest.mark.parametrize(("flow", "bound"), [("poiseuille", 0.002), ("couette", 0.004)])
 def test_start_up_at_20_across(flow, bound):
-    """RMS error over the largest velocity, through the start-up to the steady state: measured 0.65 and 1.0 %.
+    """RMS error over the largest velocity, through the start-up to the steady state: measured 0.13 and 0.33 %.
 
-    The issue asks for 0.5 % at 40 across; 0.25 and 0.54 % are reached there at t = 0.5 s. What is left is friction
-    at the wall, which the half-space integral gives to first order.
+    The issue asks for 0.5 % at 40 across; 0.03 and 0.05 % are reached there at t = 0.5 s. Rows that are not centred
+    between the walls cost up to 1 %.
     """
     assert max(channel_error(flow, 20, (0.1, 0.5, 2.0))) < bound
 

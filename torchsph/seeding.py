@@ -130,6 +130,9 @@ def _boltzmann(
     scale = seeding.temperature * 0.5 * model.stiffness * sound**2
     origin = torch.floor(lower)
     counts = (torch.ceil(upper) - origin).to(torch.int64).tolist()
+    for axis, count in enumerate(_whole_periods(simulator)):
+        if count:
+            origin[axis], counts[axis] = 0.0, count
     corner = _lattice(origin, counts) - 0.5
     # a vectorised sweep over cells, repeated where the try was refused, keeps about one particle per cell
     wall = simulator.domain.sample_at(corner + 0.5)
@@ -151,8 +154,9 @@ def _quiet(
     simulator: Simulator, seeding: Seeding, lower: Tensor, upper: Tensor, generator: torch.Generator
 ) -> Tensor:
     """A lattice inside the walls, relaxed by shifting down the crowding gradient (Colagrossi et al. 2012)."""
-    counts = (torch.ceil(upper - lower) + 1).to(torch.int64).tolist()
-    origin = lower - 0.25
+    # centred: rows at uneven distances from opposite walls are a density gradient that no wall model can undo
+    size = torch.ceil(upper - lower - 1e-3)
+    counts, origin = size.to(torch.int64).tolist(), 0.5 * (lower + upper - size)
     for axis, count in enumerate(_whole_periods(simulator)):
         if count:
             origin[axis], counts[axis] = 0.0, count
