@@ -9,6 +9,7 @@ from torch import Tensor
 
 from geometry import Grid
 
+from .lookup import LookUp
 from .pairs.interface import per_particle
 from .particles import Particles
 from .record import Record
@@ -38,14 +39,15 @@ class Domain:
         smoothing = kernel(scheme.kernel)
         self.support_radius = smoothing.support * scheme.smoothing_ratio
         self.period = self._period()
-        self._gravity = None
-        if scene.gravity is not None:
-            self._gravity = torch.tensor(scene.gravity, dtype=dtype, device=device) / units.acceleration
+        self._steady_gravity = None
+        if scene.gravity is not None and not callable(scene.gravity):
+            self._steady_gravity = self._acceleration([scene.gravity])
         self.walls: WallFields | None = None
         self.sources = self.reservoirs = None
         self._open: tuple[int, ...] = ()
         self._bracket: tuple[float, float] = (0.0, 1.0)
         self._keys: tuple[Tensor, Tensor] | None = None
+        self._fields: LookUp | None = None
         self._times: Tensor | None = None
         if scene.walls is not None:
             complete = isinstance(scheme.wall, CompleteKernelWall)
@@ -118,7 +120,9 @@ class Domain:
             late = min(max(bisect.bisect_left(times, middle), 1), len(times) - 1) if len(times) > 1 else 0
             early = max(late - 1, 0)
             self._bracket = (float(times[early]), float(times[late]))
-            self._keys = (self.walls.key(early, self._open), self.walls.key(late, self._open))
+            keys = (self.walls.key(early, self._open), self.walls.key(late, self._open))
+            if self._keys is None or keys[0] is not self._keys[0] or keys[1] is not self._keys[1]:
+                self._keys, self._fields = keys, self.walls.between(*keys)
         self.at(start)
 
     def prepare_until(self, start: float, stop: float) -> None:
@@ -154,22 +158,35 @@ class Domain:
             share = (self._times - early) / (late - early)
             fraction = share.clamp(0.0, 1.0).to(self.dtype)
             fraction = per_particle(fraction, particles.member) if fraction.ndim else fraction
-        return self.walls.sample(*self._keys, fraction, self._wrapped_points(particles.position))
+        return self.walls.sample(self._fields, fraction, self._wrapped_points(particles.position))
 
     def sample_at(self, position: Tensor) -> WallSample:
         """Walls at points (n, D), internal, at the present time (one for all members)."""
         early, late = self._bracket
         share = float((self._times.max() - early) / (late - early)) if late > early else 0.0
         fraction = torch.full((), min(max(share, 0.0), 1.0), dtype=self.dtype, device=self.device)
-        return self.walls.sample(*self._keys, fraction, self._wrapped_points(position))
+        return self.walls.sample(self._fields, fraction, self._wrapped_points(position))
 
     def body_force(self, particles: Particles) -> Tensor | None:
         """Acceleration (N, D) by gravity and pressure sources, or None."""
-        total = None if self._gravity is None else self._gravity.expand_as(particles.position)
+        total = self._gravity(particles)
         if self.sources is not None and self._open:
             push = self.sources.acceleration(particles, self._open, self.time_of(particles))
             total = push if total is None else total + push
         return total
+
+    def _gravity(self, particles: Particles) -> Tensor | None:
+        """Gravity at the particles' present times (N, D) or None."""
+        if self._steady_gravity is not None:
+            return self._steady_gravity.expand_as(particles.position)
+        if self.scene.gravity is None:
+            return None
+        times = self.member_times(particles.members).tolist()
+        return self._acceleration([self.scene.gravity_at(t) for t in times]).index_select(0, particles.member)
+
+    def _acceleration(self, rows: list[tuple[float, ...]]) -> Tensor:
+        """Rows (n, D), m/s^2, as internal accelerations."""
+        return torch.tensor(rows, dtype=self.dtype, device=self.device) / self.units.acceleration
 
     def prepare(self, particles: Particles) -> Particles:
         """What an interval needs before its first step: buffers behind valves that have just opened."""

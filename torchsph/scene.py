@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import geometry
@@ -63,7 +65,8 @@ class Scene:
         fluid: density and viscosity.
         walls: closed moving surface around the fluid, or None (no wall).
         valves: orifices of the wall; () where the wall has none.
-        gravity: acceleration (D,), m/s^2, or None.
+        gravity: acceleration (D,), m/s^2, or None; or a function of time (s) that returns it, for a body force that
+            changes (a pulsating pressure gradient, an accelerated frame).
         period: lengths (D,) of a periodic box that starts at the origin, m; None entries are not periodic.
         reference_speed: largest speed that is expected, m/s; it sets the internal units and the default sound speed.
         dimension: 2 or 3.
@@ -73,7 +76,7 @@ class Scene:
     fluid: Fluid = field(default_factory=Fluid)
     walls: geometry.WallMotion | None = None
     valves: tuple[Valve, ...] = ()
-    gravity: tuple[float, ...] | None = None
+    gravity: tuple[float, ...] | Callable[[float], Sequence[float]] | None = None
     period: tuple[float | None, ...] | None = None
     reference_speed: float = 1.0
     dimension: int = 3
@@ -89,8 +92,22 @@ class Scene:
             raise ValueError("a scene with valves needs walls: the valves are orifices of the wall")
         for name in ("gravity", "period"):
             value = getattr(self, name)
-            if value is not None and len(value) != self.dimension:
+            if value is not None and not callable(value) and len(value) != self.dimension:
                 raise ValueError(f"Scene.{name} needs {self.dimension} entries, got {len(value)}")
+
+    def gravity_at(self, time: float) -> tuple[float, ...]:
+        """The body force per mass (D,), m/s^2, at ``time`` (s).
+
+        Raises ValueError where a function of time returns anything but D finite numbers.
+        """
+        if not callable(self.gravity):
+            return (0.0,) * self.dimension if self.gravity is None else tuple(self.gravity)
+        value = tuple(float(part) for part in self.gravity(time))
+        if len(value) != self.dimension or not all(math.isfinite(part) for part in value):
+            raise ValueError(
+                f"Scene.gravity must return {self.dimension} finite accelerations (m/s^2), got {value} at {time:g} s"
+            )
+        return value
 
     @classmethod
     def from_recording(cls, recording: geometry.Recording, spacing: float | None = None) -> Scene:
