@@ -4,10 +4,9 @@ from copy import copy
 
 import numpy as np
 import torch
-from scipy.linalg import LinAlgError, cho_solve_banded, cholesky_banded
-from scipy.linalg.blas import dtbmv, dtbsv
+from scipy.linalg.blas import dtbmv
 
-from . import gram_triton, native
+from . import cholesky, gram_triton, native
 from .assembly import reference_band
 from .banded import to_single
 from .block import BlockFactor
@@ -108,42 +107,40 @@ class Factor:
     """
 
     def __init__(self, band: torch.Tensor, ordering: Ordering) -> None:
-        self.ordering = ordering
-        try:
-            self.band = cholesky_banded(band.numpy().T, overwrite_ab=True, lower=True, check_finite=False)
-        except LinAlgError as error:
+        self.ordering, self.band = ordering, band
+        self.reach = ordering.reach(len(band) // len(ordering.nodes))
+        if not cholesky.factorise(band, self.reach):
             raise InvalidInput(
                 "the normal matrix is not positive definite: some coefficients are fixed by no row; give a "
                 "curvature or damping above 0"
-            ) from error
+            )
 
     def solve(self, right: torch.Tensor) -> torch.Tensor:
         """(active, C) or (active, C, k) in solve order -> the same shape."""
-        flat = right.reshape(right.shape[0] * right.shape[1], *right.shape[2:]).numpy()
-        solved = cho_solve_banded((self.band, True), flat.astype(self.band.dtype), check_finite=False)
-        return torch.from_numpy(solved).double().view(right.shape)
+        flat = right.reshape(len(self.band), -1).to(self.band.dtype)
+        half = cholesky.solve_lower(self.band, self.reach, flat)
+        return cholesky.solve_upper(self.band, self.reach, half).double().view(right.shape)
 
     def spread(self, white: torch.Tensor) -> torch.Tensor:
         """The factor times white (unknowns, k): draws whose covariance is the factored matrix."""
-        half = self.band.shape[0] - 1
-        columns = [dtbmv(half, self.band, z, lower=1) for z in white.T.contiguous().numpy()]
+        band = self.band.numpy().T  # LAPACK's layout
+        columns = [dtbmv(len(band) - 1, band, z, lower=1) for z in white.T.contiguous().numpy()]
         return torch.from_numpy(np.stack(columns, axis=1))
 
     def sample(self, precision: float, generator: torch.Generator) -> torch.Tensor:
         """(active, C) Gaussian draw of mean 0 with ``precision`` times the factored matrix as precision."""
-        count = self.band.shape[1]
-        white = torch.randn(count, generator=generator, dtype=torch.float64).numpy()
+        white = torch.randn(len(self.band), 1, generator=generator, dtype=torch.float64)
         # L' x = z gives x the covariance (L L')^-1
-        draw = dtbsv(self.band.shape[0] - 1, self.band, white, lower=1, trans=1)
-        return torch.from_numpy(draw).view(len(self.ordering.nodes), -1) / precision**0.5
+        draw = cholesky.solve_upper(self.band, self.reach, white)
+        return draw.view(len(self.ordering.nodes), -1) / precision**0.5
 
     def diagonal(self) -> torch.Tensor:
         """(unknowns,) squares of the factor's diagonal: conditional precisions, a guess of the matrix's."""
-        return torch.from_numpy(self.band[0]).square()
+        return self.band[:, 0].double().square()
 
     def log_determinant(self) -> float:
         """Natural logarithm of the determinant of the normal matrix."""
-        return 2.0 * float(torch.from_numpy(self.band[0]).log().sum())
+        return 2.0 * float(self.band[:, 0].log().sum())
 
 
 def solve_direct(

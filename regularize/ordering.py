@@ -43,6 +43,12 @@ class Ordering:
         local = torch.arange(self.knots.local_size, device=self.keys.device)
         return local.view(size).permute(array_axes).flatten()
 
+    def reach(self, components: int) -> torch.Tensor:
+        """(active * C,) last unknown that shares a row with an unknown or with one before it: the envelope."""
+        first, last = self.position[:, 0], self.position[:, -1]
+        reach = torch.zeros_like(self.nodes).scatter_reduce(0, first, last, "amax").cummax(0).values
+        return (components * (reach + 1) - 1).repeat_interleave(components)
+
     def slabs(self) -> torch.Tensor:
         """(slabs + 1,) starts in ``keys`` of runs of degree + 1 cell layers along the slowest axis.
 

@@ -19,8 +19,7 @@ class Posterior:
 
     def __init__(self, factor: Factor, precision: float, components: int) -> None:
         self.ordering, self.components, self.precision = factor.ordering, components, precision
-        # SciPy hands back LAPACK's (width, unknowns) layout; its transpose is ours
-        self._band = np.ascontiguousarray(factor.band.T)
+        self._band = factor.band.numpy()
         self._blocks: list[tuple[torch.Tensor, torch.Tensor | None]] | None = None
 
     def variance(self, points: torch.Tensor) -> torch.Tensor:

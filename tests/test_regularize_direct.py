@@ -147,7 +147,7 @@ def test_float32_factor_refined_equals_float64():
     system = System(knots, 3, list(blocks.values()), 0.3)
     double, _ = solve_direct(system, tolerance=1e-12)
     single, factor = solve_direct(system, tolerance=1e-12, single=True)
-    assert factor.band.dtype == "float32" and single.gradient <= 1e-12 and single.iterations > 1
+    assert factor.band.dtype == torch.float32 and single.gradient <= 1e-12 and single.iterations > 1
     assert torch.allclose(single.x, double.x, atol=1e-10)
 
 
@@ -157,4 +157,4 @@ def test_float32_factor_that_fails_gives_way_to_float64(damping):
     rows = VectorRows(knots, points, draw, torch.full((6, 1), 1e2, dtype=torch.float64))
     system = System(knots, 2, [rows], damping)
     solution, factor = solve_direct(system, tolerance=1e-6, single=True)
-    assert factor.band.dtype == "float64" and solution.gradient <= 1e-6
+    assert factor.band.dtype == torch.float64 and solution.gradient <= 1e-6
