@@ -93,7 +93,7 @@ def test_look_up_fields_of_a_box_are_exact_near_its_sides():
     made = fields(geometry.box((0, 0, 0), (0.02, 0.012, 0.012), 2e-3))
     key = made.key(0, ())
     points = torch.tensor([[10.0, 6.0, 0.3], [10.0, 6.0, -0.4], [0.7, 6.0, 6.0]], dtype=torch.float64)
-    seen = made.sample(key, key, torch.zeros(()).double(), points)
+    seen = made.sample(made.between(key, key), torch.zeros(()).double(), points)
     torch.testing.assert_close(seen.distance, torch.tensor([0.3, -0.4, 0.7]).double(), atol=1e-6, rtol=0)
     torch.testing.assert_close(seen.normal[0], torch.tensor([0.0, 0, 1]).double(), atol=1e-6, rtol=0)
     assert seen.share is not None
@@ -104,7 +104,7 @@ def test_potential_walls_store_no_kernel_share():
     made = fields(geometry.box((0, 0, 0), (0.02, 0.012, 0.012), 2e-3), model=PotentialWall())
     key = made.key(0, ())
     assert key.shape[0] == 7
-    assert made.sample(key, key, torch.zeros(()).double(), torch.ones(1, 3).double()).share is None
+    assert made.sample(made.between(key, key), torch.zeros(()).double(), torch.ones(1, 3).double()).share is None
 
 
 def test_an_open_orifice_is_no_wall():
@@ -115,10 +115,10 @@ def test_an_open_orifice_is_no_wall():
     above = centre * torch.tensor([1.0, 1.0, -1.0]).double()
     shut, opened = made.key(0, ()), made.key(0, (1,))
     zero = torch.zeros(()).double()
-    assert float(made.sample(shut, shut, zero, centre).distance) == pytest.approx(1 / 3, abs=0.02)
-    assert float(made.sample(opened, opened, zero, centre).distance) > 1.5
-    assert float(made.sample(shut, shut, zero, above).distance) < 0
-    assert float(made.sample(opened, opened, zero, above).distance) > 1.5
-    assert float(made.sample(opened, opened, zero, centre).share) > 0.9 > float(
-        made.sample(shut, shut, zero, centre).share
+    assert float(made.sample(made.between(shut, shut), zero, centre).distance) == pytest.approx(1 / 3, abs=0.02)
+    assert float(made.sample(made.between(opened, opened), zero, centre).distance) > 1.5
+    assert float(made.sample(made.between(shut, shut), zero, above).distance) < 0
+    assert float(made.sample(made.between(opened, opened), zero, above).distance) > 1.5
+    assert float(made.sample(made.between(opened, opened), zero, centre).share) > 0.9 > float(
+        made.sample(made.between(shut, shut), zero, centre).share
     )

@@ -168,8 +168,10 @@ class Reservoirs:
         return torch.where(flat[owner], ones, shape) * scale[owner]
 
     def _orifice_velocity(self, frame: _Frame) -> Tensor:
-        """Velocity of the orifice itself (D,), from its key-frame motion."""
-        return self.domain.sample_at(frame.centre[None]).velocity[0]
+        """Velocity of the orifice itself (D,) in the present interval, from its key-frame motion."""
+        if frame.velocity is None:
+            frame.velocity = self.domain.sample_at(frame.centre[None]).velocity[0]
+        return frame.velocity
 
     def exchange(self, particles: Particles, record: Record) -> tuple[Particles, bool]:
         """Turn particles that have crossed an open orifice into the other kind; feed and clear the far ends."""
@@ -231,6 +233,7 @@ class _Frame:
         )
         self.centre, self.normal, self.basis = tensor(self._plane.centroid), tensor(plane.normal), tensor(plane.basis)
         self.area = float(self._plane.area)
+        self.velocity: Tensor | None = None
         self.radius = float(np.linalg.norm(self._plane.outline, axis=1).max())
 
     def height(self, position: Tensor) -> Tensor:

@@ -13,6 +13,7 @@ from torch.nn import functional
 from geometry import Grid, OrificePlane, Surface, WallMotion, grid_winding, orifices
 from geometry.closest import SurfaceIndex
 
+from .lookup import LookUp
 from .smoothing import SmoothingKernel
 from .walls import WallSample
 
@@ -113,26 +114,19 @@ class WallFields:
         flat = np.ravel_multi_index(tuple(donor), close.shape).reshape(-1)
         return np.flatnonzero(close), number[flat]
 
-    def sample(self, first: Tensor, second: Tensor, fraction: Tensor, position: Tensor) -> WallSample:
-        """Walls at positions (N, D), internal; ``fraction`` (N,) of the way from key fields ``first`` to ``second``."""
-        early = self._look_up(first, position)
-        values = early if first is second else early + fraction * (self._look_up(second, position) - early)
+    def between(self, first: Tensor, second: Tensor) -> LookUp:
+        """The fields of two key frames made ready for look-ups between them."""
+        return LookUp(self.grid, first, second, self.spacing)
+
+    def sample(self, fields: LookUp, fraction: Tensor, position: Tensor) -> WallSample:
+        """Walls at positions (N, D), internal; ``fraction`` (N,) or () of the way from the first key frame."""
+        values = fields.at(position, fraction)
         d = self.dimension
-        normal = functional.normalize(values[1 : 1 + d].T, dim=1)
-        sample = (values[0], normal, values[1 + d : 1 + 2 * d].T)
+        normal = functional.normalize(values[:, 1 : 1 + d], dim=1)
+        sample = (values[:, 0], normal, values[:, 1 + d : 1 + 2 * d])
         if not self.complete:
             return WallSample(*sample)
-        return WallSample(*sample, values[1 + 2 * d], values[2 + 2 * d :].T)
-
-    def _look_up(self, fields: Tensor, position: Tensor) -> Tensor:
-        """Multilinear interpolation of (C, *shape) at (N, D): (C, N); beyond the grid its edge continues."""
-        origin = position.new_tensor(self.grid.origin) / self.spacing
-        step = position.new_tensor(self.grid.spacing) / self.spacing
-        last = position.new_tensor([n - 1 for n in reversed(self.grid.shape)])
-        unit = 2.0 * (position - origin) / (step * last) - 1.0
-        lattice = unit.reshape(1, *[1] * (self.dimension - 1), -1, self.dimension)
-        out = functional.grid_sample(fields[None], lattice, mode="bilinear", padding_mode="border", align_corners=True)
-        return out.reshape(fields.shape[0], -1)
+        return WallSample(*sample, values[:, 1 + 2 * d], values[:, 2 + 2 * d :])
 
 
 def _with_channel(
