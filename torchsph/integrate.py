@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import torch
 from torch import Tensor
 
-from .pairs.interface import Backend, MomentumTerms, Rates, RateTerms, Support, per_particle
+from .neighbours import PairSearch
+from .pairs.centroid import centroid_xsph
+from .pairs.interface import MomentumTerms, Rates, RateTerms, Support, per_particle
+from .parameters import Coefficients
 from .particles import Particles
 from .schemes import CompleteKernelWall, PotentialWall, WeaklyCompressible
 from .second_order import predictor_corrector_step, verlet_step
@@ -30,52 +33,6 @@ class Surroundings(Protocol):
         """Acceleration (N, D) by gravity and pressure sources, or None."""
 
 
-@dataclass
-class PairSearch:
-    """The neighbour list and where the particles were when it was made."""
-
-    backend: Backend
-    radius: float
-    margin: float
-    period: Tensor | None = None
-    pairs: Any = None
-    made_at: Tensor | None = None
-    searches: int = 0
-
-    def stale(self, particles: Particles) -> bool:
-        """Whether the particles have moved, or changed in number, beyond what the list allows for."""
-        if self.made_at is None or self.made_at.shape != particles.position.shape:
-            return True
-        if particles.count == 0:
-            return False
-        moved = (particles.position - self.made_at).square().sum(1).amax().item()
-        return not moved < (0.5 * self.margin) ** 2
-
-    def at(self, particles: Particles) -> Any:
-        """Pairs that are valid at the particles' present positions."""
-        if self.stale(particles):
-            self.pairs = self.backend.search(
-                particles.position, particles.member, self.radius, margin=self.margin, period=self.period
-            )
-            self.made_at = particles.position
-            self.searches += 1
-        return self.pairs
-
-    def forget(self) -> None:
-        """The particles were renumbered: the next call searches anew."""
-        self.made_at = None
-
-
-@dataclass(frozen=True)
-class Coefficients:
-    """The scheme's options in internal units; entries may be tensors (members,)."""
-
-    sound_speed: float | Tensor
-    viscosity: float | Tensor | None
-    artificial: float | Tensor | None
-    smoothing_length: float
-
-
 @dataclass(frozen=True)
 class RateSums:
     """Density rate (N,), velocity divergence (N,), crowding gradient (N, D) or None, and the raw sums."""
@@ -87,32 +44,38 @@ class RateSums:
 
 
 class Stepper:
-    """Steps particles with one scheme; holds no state but the neighbour list."""
+    """Steps particles with one scheme; holds no state but the neighbour list and the coefficients in use."""
 
     def __init__(
         self, scheme: WeaklyCompressible, coefficients: Coefficients, search: PairSearch, dimension: int
     ) -> None:
-        self.scheme, self.coefficients, self.pair_search = scheme, coefficients, search
-        self.support = Support(kernel(scheme.kernel), coefficients.smoothing_length, dimension)
-        velocity_xsph = scheme.xsph is not None and scheme.xsph.level == "velocity"
-        self.velocity_xsph = scheme.xsph.epsilon if velocity_xsph else None
-        self.position_xsph = scheme.xsph.epsilon if scheme.xsph is not None and not velocity_xsph else None
+        self.scheme, self.pair_search, self.dimension = scheme, search, dimension
+        self.use(coefficients)
+
+    def use(self, coefficients: Coefficients) -> None:
+        """Step with these coefficients from now on."""
+        self.coefficients, scheme = coefficients, self.scheme
+        self.support = Support(kernel(scheme.kernel), coefficients.smoothing_length, self.dimension)
+        moves = coefficients.xsph is not None and scheme.xsph.level == "position"
+        self.position_xsph = coefficients.xsph if moves else None
+        self.velocity_xsph = None if moves else coefficients.xsph
+        self._centroid = coefficients.xsph is not None and scheme.xsph.form == "centroid"
         laminar = coefficients.viscosity
         if laminar is not None:
-            laminar = laminar / softened_share(self.support.kernel, dimension)
+            laminar = laminar / softened_share(self.support.kernel, self.dimension)
         self.momentum_terms = MomentumTerms(
             pressure=scheme.pressure, artificial=coefficients.artificial, laminar=laminar,
             tensile=scheme.tensile,
         )
         self._rate_terms = RateTerms(
-            continuity=scheme.continuity, diffusion=scheme.density_diffusion is not None,
-            concentration=scheme.shifting is not None, xsph=self.position_xsph is not None,
+            continuity=scheme.continuity, diffusion=coefficients.diffusion is not None,
+            concentration=coefficients.shifting is not None, xsph=moves and not self._centroid,
         )
 
     def step(
-        self, particles: Particles, step: Tensor, number: int, around: Surroundings
+        self, particles: Particles, step: Tensor, number: Tensor, around: Surroundings
     ) -> tuple[Particles, Tensor, WallSample | None]:
-        """Advance every member by its own ``step`` (members,), internal time; ``number`` counts the steps.
+        """Advance every member by its own ``step`` (members,), internal time, its ``number``-th (members,), from 1.
 
         Returns the particles, the acceleration (N, D) of the fluid that the next step's force limit needs, and the
         walls that the particles saw.
@@ -126,14 +89,14 @@ class Stepper:
         return self._symplectic_step(particles, step, number, around)
 
     def _symplectic_step(
-        self, particles: Particles, step: Tensor, number: int, around: Surroundings
+        self, particles: Particles, step: Tensor, number: Tensor, around: Surroundings
     ) -> tuple[Particles, Tensor, WallSample | None]:
         """Both passes at the same position; velocity first, then position (symplectic Euler)."""
         dt = per_particle(step, particles.member)
         wall = around.sample(particles)
         pairs = self.pair_search.at(particles)
-        filtering = self._filter_due(number)
-        terms = self._rate_terms if not filtering else _with_shepard(self._rate_terms)
+        filtering = self._filter_due(number, step)
+        terms = self._rate_terms if filtering is None else replace(self._rate_terms, shepard=True)
         rates = self.pair_search.backend.rates(pairs, self._pressureless(particles), self.support, terms)
         compression, crowding = self._complete(particles, rates, wall)
         particles = self._new_density(particles, rates, compression, dt, filtering)
@@ -147,15 +110,21 @@ class Stepper:
     def wandering(self, particles: Particles, rates: Rates, crowding: Tensor | None, step: Tensor) -> Tensor:
         """What moves particles in a step beside their velocity: position XSPH and shifting, (N, D)."""
         drift = torch.zeros_like(particles.position)
-        if rates.xsph is not None:
-            dt = per_particle(step, particles.member)
-            drift = drift + self.position_xsph * dt[:, None] * rates.xsph
+        if self.position_xsph is not None:
+            share = per_particle(step * self.position_xsph, particles.member)
+            pull = self._centroid_pull(particles) if self._centroid else rates.xsph
+            drift = drift + share[:, None] * pull
         if crowding is not None:
             drift = drift + shifting_displacement(
-                particles, crowding, step, self.coefficients.smoothing_length, self.scheme.shifting,
+                particles, crowding, step, self.coefficients.smoothing_length, self.coefficients.shifting,
                 self.scheme.shifting_speed == "largest",
             )
         return torch.where(particles.fluid[:, None], drift, torch.zeros_like(drift))
+
+    def _centroid_pull(self, particles: Particles) -> Tensor:
+        """XSPH by the centroids of cells (N, D); 1.5 cells reach as far as the kernel, so adjacent cells hold all."""
+        cell = self.support.radius / 1.5
+        return centroid_xsph(self._pressureless(particles), self.support, cell, self.pair_search.period)
 
     def evaluate_rates(self, particles: Particles, pairs: Any, wall: WallSample | None) -> RateSums:
         """Density rate and its companions at one state."""
@@ -164,7 +133,7 @@ class Stepper:
         return RateSums(self._density_rate(particles, sums, divergence), divergence, crowding, sums)
 
     def _thesis_step(
-        self, particles: Particles, step: Tensor, number: int, around: Surroundings
+        self, particles: Particles, step: Tensor, number: Tensor, around: Surroundings
     ) -> tuple[Particles, Tensor, WallSample | None]:
         """Algorithm 1 as printed: density and position with p^n, then forces at the new position, then XSPH.
 
@@ -176,27 +145,36 @@ class Stepper:
         wall = around.sample(particles) if isinstance(self.scheme.wall, CompleteKernelWall) else None
         rates = backend.rates(pairs, self._pressureless(particles), self.support, self._rate_terms)
         compression, _ = self._complete(particles, rates, wall)
-        particles = self._new_density(particles, rates, compression, dt, filtering=False)
+        particles = self._new_density(particles, rates, compression, dt)
         particles = particles.changed(position=particles.position + dt[:, None] * particles.velocity)
         pairs, wall = self.pair_search.at(particles), around.sample(particles)
         acceleration = self.acceleration(particles, pairs, compression, wall, around)
         particles = particles.changed(velocity=particles.velocity + dt[:, None] * acceleration)
         particles = self.retarded(particles, wall, dt)
-        filtering = self._filter_due(number)
-        if self.velocity_xsph is not None or filtering:
-            wanted = RateTerms(continuity=None, xsph=self.velocity_xsph is not None, shepard=filtering)
-            sums = backend.rates(pairs, self._pressureless(particles), self.support, wanted)
-            if sums.xsph is not None:
-                # a step of zero length (a member that waits for the others) must not smooth
-                share = (dt > 0).to(dt.dtype)[:, None] * self.velocity_xsph
-                particles = particles.changed(velocity=particles.velocity + share * sums.xsph)
-            if filtering:
-                particles = particles.changed(deviation=_filtered(particles, sums, dt))
+        filtering = self._filter_due(number, step)
+        smoothing = self.velocity_xsph is not None
+        if smoothing or filtering is not None:
+            wanted = RateTerms(
+                continuity=None, xsph=smoothing and not self._centroid, shepard=filtering is not None
+            )
+            state = particles
+            sums = backend.rates(pairs, self._pressureless(state), self.support, wanted)
+            if smoothing:
+                pull = self._centroid_pull(state) if self._centroid else sums.xsph
+                share = per_particle(self.velocity_xsph, particles.member)
+                share = share[:, None] if isinstance(share, Tensor) else share
+                particles = particles.changed(velocity=particles.velocity + share * pull)
+            if filtering is not None:
+                particles = particles.changed(deviation=_filtered(particles, sums, filtering))
         return particles, acceleration, wall
 
-    def _filter_due(self, number: int) -> bool:
+    def _filter_due(self, number: Tensor, step: Tensor) -> Tensor | None:
+        """Members (members,) bool whose density is filtered in this step, or None: no member's is."""
         period = self.scheme.shepard_period
-        return period is not None and number % period == period - 1
+        if period is None:
+            return None
+        due = (number % period == 0) & (step > 0)
+        return due if bool(due.any()) else None
 
     @staticmethod
     def _pressureless(particles: Particles) -> Any:
@@ -224,18 +202,19 @@ class Stepper:
         return divergence, crowding
 
     def _new_density(
-        self, particles: Particles, rates: Rates, divergence: Tensor, dt: Tensor, filtering: bool
+        self, particles: Particles, rates: Rates, divergence: Tensor, dt: Tensor, filtering: Tensor | None = None
     ) -> Particles:
         deviation = particles.deviation + dt * self._density_rate(particles, rates, divergence)
-        if filtering:
-            deviation = _filtered(particles.changed(deviation=deviation), rates, dt)
+        if filtering is not None:
+            deviation = _filtered(particles.changed(deviation=deviation), rates, filtering)
         return particles.changed(deviation=deviation)
 
     def _density_rate(self, particles: Particles, rates: Rates, divergence: Tensor) -> Tensor:
         rate = -(1.0 + particles.deviation) * divergence
         if rates.diffusion is not None:
-            sound = per_particle(self.coefficients.sound_speed, particles.member)
-            rate = rate + self.scheme.density_diffusion * self.coefficients.smoothing_length * sound * rates.diffusion
+            c = self.coefficients
+            spread = per_particle(c.diffusion * c.smoothing_length * c.sound_speed, particles.member)
+            rate = rate + spread * rates.diffusion
         return rate
 
     def pressure(self, particles: Particles, divergence: Tensor | None = None) -> Tensor:
@@ -243,12 +222,13 @@ class Stepper:
 
         Forms other than the symmetric one leave the background out: it must not change an incompressible flow.
         """
-        sound = per_particle(self.coefficients.sound_speed, particles.member)
-        pressure = tait_pressure(particles.deviation, sound, self.scheme.gamma)
-        if self.scheme.pressure == "symmetric":
-            pressure = pressure + self.scheme.background_pressure * sound**2
-        if self.scheme.bulk_damping is not None and divergence is not None:
-            damping = self.scheme.bulk_damping * sound * self.coefficients.smoothing_length * divergence
+        c, member = self.coefficients, particles.member
+        sound = per_particle(c.sound_speed, member)
+        pressure = tait_pressure(particles.deviation, sound, per_particle(c.gamma, member))
+        if self.scheme.pressure == "symmetric" and c.background is not None:
+            pressure = pressure + per_particle(c.background, member) * sound**2
+        if c.bulk_damping is not None and divergence is not None:
+            damping = per_particle(c.bulk_damping * c.sound_speed * c.smoothing_length, member) * divergence
             pressure = pressure - torch.where(particles.fluid, damping, torch.zeros_like(damping))
         return pressure
 
@@ -282,11 +262,7 @@ class Stepper:
         return particles.changed(velocity=torch.where(particles.fluid[:, None], velocity, particles.velocity))
 
 
-def _with_shepard(terms: RateTerms) -> RateTerms:
-    return RateTerms(terms.continuity, terms.diffusion, terms.concentration, terms.xsph, True, terms.renormalisation)
-
-
-def _filtered(particles: Particles, sums: Rates, dt: Tensor) -> Tensor:
-    """Shepard-filtered density (2.20), taken only by members that really step."""
+def _filtered(particles: Particles, sums: Rates, due: Tensor) -> Tensor:
+    """Density deviation after the Shepard filter (2.20) of the members where ``due`` (members,)."""
     smooth = sums.shepard_mass / sums.shepard_volume - 1.0
-    return torch.where(dt > 0, smooth, particles.deviation)
+    return torch.where(due[particles.member], smooth, particles.deviation)

@@ -23,6 +23,7 @@ class Particles:
         member: (N,) int64, 0 <= member < members.
         kind: (N,) int64, FLUID, or RESERVOIR + v for a particle of the buffer of valve v.
         members: B.
+        label: (N,) int64, a numbering that survives sorting, or None.
     """
 
     position: Tensor
@@ -32,6 +33,7 @@ class Particles:
     member: Tensor
     kind: Tensor
     members: int
+    label: Tensor | None = None
 
     @property
     def count(self) -> int:
@@ -54,20 +56,36 @@ class Particles:
 
     def select(self, keep: Tensor) -> Particles:
         """The particles where ``keep`` (N,) bool, or the indices in ``keep``."""
-        return replace(self, **{name: getattr(self, name)[keep] for name in _ARRAYS})
+        return replace(self, **{name: value[keep] for name, value in self._arrays().items()})
 
     def joined(self, other: Particles) -> Particles:
-        """These particles followed by those of ``other``."""
-        return replace(self, **{n: torch.cat([getattr(self, n), getattr(other, n)]) for n in _ARRAYS})
+        """These particles followed by those of ``other``, which get new labels where they have none."""
+        theirs = other._arrays()
+        if self.label is not None and other.label is None:
+            first = int(self.label.max()) + 1 if self.count else 0
+            theirs["label"] = torch.arange(first, first + other.count, device=self.label.device)
+        return replace(self, **{name: torch.cat([value, theirs[name]]) for name, value in self._arrays().items()})
 
     def repeated(self, members: int) -> Particles:
-        """``members`` copies of a single member, one after the other."""
+        """``members`` copies of a single member, one after the other, without labels."""
         if self.members != 1:
             raise ValueError(f"only a single member can be repeated, this set has {self.members}")
-        arrays = {name: getattr(self, name) for name in _ARRAYS}
-        copies = {n: value.repeat((members,) + (1,) * (value.ndim - 1)) for n, value in arrays.items()}
+        copies = {n: value.repeat((members,) + (1,) * (value.ndim - 1)) for n, value in self._arrays().items()}
         member = torch.arange(members, device=self.member.device).repeat_interleave(self.count)
-        return Particles(**{**copies, "member": member}, members=members)
+        return Particles(**{**copies, "member": member, "label": None}, members=members)
+
+    def labelled(self) -> Particles:
+        """With labels 0, 1, ... in the present order."""
+        return replace(self, label=torch.arange(self.count, device=self.member.device))
+
+    def by_label(self) -> Particles:
+        """In the order of the labels, and without them."""
+        return replace(self.select(torch.argsort(self.label, stable=True)), label=None)
+
+    def _arrays(self) -> dict[str, Tensor]:
+        """Everything that has one row a particle."""
+        found = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "members"}
+        return {name: value for name, value in found.items() if value is not None}
 
     def state(self, pressure: Tensor) -> PairState:
         """What the pair passes read, with the pressure (N,) that belongs to it."""
@@ -78,5 +96,3 @@ class Particles:
         out = torch.full((self.members,), empty, dtype=values.dtype, device=values.device)
         return out.scatter_reduce(0, self.member, values, reduce, include_self=reduce == "sum")
 
-
-_ARRAYS = tuple(f.name for f in fields(Particles) if f.name != "members")

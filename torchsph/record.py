@@ -24,13 +24,16 @@ class Record:
         limited_by: how many steps each limit decided, (members, limits); names in ``terms.LIMITS``.
         reductions: how often a limit asked for a step shorter than the step before by more than a hundredth.
         floored: steps that the scheme's floor kept longer than the limits asked for; such a run may be unstable.
-        searches: neighbour searches (all members together).
+        rollbacks: how often the member went back to an earlier state to try again with shorter steps.
+        searches, overflows: neighbour searches, and those made again because the lists outgrew their room; both of all
+            members together.
     """
 
     members: int
     valves: int = 0
     device: str | torch.device = "cpu"
     searches: int = 0
+    overflows: int = 0
     steps: Tensor = field(init=False)
     failed: Tensor = field(init=False)
     smallest_density: Tensor = field(init=False)
@@ -43,13 +46,14 @@ class Record:
     limited_by: Tensor = field(init=False)
     reductions: Tensor = field(init=False)
     floored: Tensor = field(init=False)
+    rollbacks: Tensor = field(init=False)
 
     def __post_init__(self) -> None:
         def counts(*shape: int) -> Tensor:
             return torch.zeros((self.members, *shape), dtype=torch.int64, device=self.device)
 
         self.steps, self.outside, self.crossed_wall = counts(), counts(), counts()
-        self.reductions, self.floored = counts(), counts()
+        self.reductions, self.floored, self.rollbacks = counts(), counts(), counts()
         self.inserted, self.removed, self.limited_by = counts(self.valves), counts(self.valves), counts(len(LIMITS))
         self.failed = torch.zeros(self.members, dtype=torch.bool, device=self.device)
         one = torch.ones(self.members, dtype=torch.float64, device=self.device)
@@ -79,4 +83,5 @@ class Record:
             "crossed_wall": self.crossed_wall.tolist(), "inserted": self.inserted.tolist(),
             "removed": self.removed.tolist(), "limited_by": steps, "searches": self.searches,
             "reductions": self.reductions.tolist(), "floored": self.floored.tolist(),
+            "rollbacks": self.rollbacks.tolist(), "overflows": self.overflows,
         }

@@ -15,17 +15,65 @@ class XSPH:
     """XSPH (2.33): neighbours' velocities pull with strength ``epsilon``.
 
     ``level`` is "velocity" (2.34: the momentum itself is smoothed, as in the thesis; strongly dissipative) or
-    "position" (Monaghan 1989: only the motion of the particles).
+    "position" (Monaghan 1989: only the motion of the particles). ``form`` is "pairs" (the full sum) or "centroid"
+    (thesis 5.2, the "poor man's XSPH": towards the mean velocities of the cells around, ``pairs.centroid``).
     """
 
     epsilon: float = 0.2
     level: str = "velocity"
+    form: str = "pairs"
 
     def __post_init__(self) -> None:
         if not 0 < self.epsilon <= 1:
             raise ValueError(f"XSPH epsilon must lie in (0, 1], got {self.epsilon}")
         if self.level not in ("velocity", "position"):
             raise ValueError(f"XSPH level must be 'velocity' or 'position', got '{self.level}'")
+        if self.form not in ("pairs", "centroid"):
+            raise ValueError(f"XSPH form must be 'pairs' or 'centroid', got '{self.form}'")
+
+
+@dataclass(frozen=True)
+class GammaRamp:
+    """The exponent gamma of (2.25) grows after a start or an imposition (thesis 5.2), so that noise meets a soft fluid.
+
+    Attributes:
+        start: gamma at the imposition; it grows linearly in time to the scheme's gamma.
+        duration: s, after which the scheme's gamma acts.
+        keep: what stays while gamma grows. "prefactor": B = rho0 c^2 / gamma, so that the fluid starts softer, with
+            the sound speed c sqrt(gamma(t) / gamma), and takes longer steps; "sound_speed": c, so that only the
+            curvature of p(rho) changes (at small density deviations, next to nothing).
+    """
+
+    start: float = 1.0
+    duration: float = 0.01
+    keep: str = "prefactor"
+
+    def __post_init__(self) -> None:
+        if not self.start > 0 or not self.duration > 0:
+            raise ValueError(f"GammaRamp needs positive start and duration (s), got {self.start}, {self.duration}")
+        if self.keep not in ("prefactor", "sound_speed"):
+            raise ValueError(f"GammaRamp.keep must be 'prefactor' or 'sound_speed', got '{self.keep}'")
+
+
+@dataclass(frozen=True)
+class Rollback:
+    """A member that fails goes back to its last good state and tries again with steps half as long.
+
+    Attributes:
+        tries: how often from one state, each time with steps half as long again; then the member is frozen there.
+        every: steps between the states that are kept; one is kept at the start of each imposed interval as well.
+        density: range of rho / rho0; a member with a particle outside counts as failed, before it is not finite.
+    """
+
+    tries: int = 3
+    every: int = 50
+    density: tuple[float, float] = (0.5, 2.0)
+
+    def __post_init__(self) -> None:
+        if self.tries < 1 or self.every < 1:
+            raise ValueError(f"Rollback needs at least one try and one step, got {self.tries}, {self.every}")
+        if not 0 <= self.density[0] < 1 < self.density[1]:
+            raise ValueError(f"Rollback.density must be a range around 1, got {self.density}")
 
 
 @dataclass(frozen=True)
@@ -104,7 +152,7 @@ class WeaklyCompressible:
         kernel: name of the smoothing kernel.
         smoothing_ratio: smoothing length h over particle spacing.
         sound_speed: numerical speed of sound, m/s.
-        gamma: exponent of the Tait equation (2.25).
+        gamma: exponent of the Tait equation (2.25). gamma_ramp: how it grows after an imposition, or None.
         background_pressure: p0 / rho0 in units of c^2 (0: none).
         continuity: "volume" or "mass" (2.19) form of the density rate.
         pressure: form of the pressure force (``MomentumTerms``).
@@ -125,6 +173,7 @@ class WeaklyCompressible:
         courant: fraction of the acoustic limit h / (c + v), of h^2/(8 nu) and of sqrt(h / |a|) / 2.
         step_floor: no step is cut below this fraction of the acoustic limit of the fluid at rest, or None: a single
             runaway particle then cannot stall a run; the record counts the steps that the floor held up.
+        rollback: second chances for members that fail, or None: they are frozen at once.
         steps_per_frame: at least so many steps between imposed frames, or None.
     """
 
@@ -149,7 +198,9 @@ class WeaklyCompressible:
     order: str = "symplectic"
     courant: float = 0.35
     step_floor: float | None = 0.02
+    rollback: Rollback | None = None
     steps_per_frame: int | None = None
+    gamma_ramp: GammaRamp | None = None
 
     def __post_init__(self) -> None:
         kernel(self.kernel)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -10,19 +11,24 @@ from torch import Tensor
 from geometry import Grid
 
 from .domain import Domain
-from .integrate import Coefficients, PairSearch, Stepper
+from .integrate import Stepper
+from .neighbours import PairSearch
 from .pairs import backend as choose_backend
+from .parameters import Coefficients, Parameters
 from .particles import Particles
 from .record import Record
+from .rollback import Checkpoints
 from .scene import Scene
-from .schemes import WeaklyCompressible, preset
+from .schemes import CompleteKernelWall, WeaklyCompressible, preset
 from .seeding import Seeding, seed_particles
-from .terms import LIMITS, step_limits
+from .stepping import StepControl
 from .transfer import Fetched, fetch_at, pulled
 from .units import Units
 
 # how far particles move before the neighbours are searched again, in spacings
 _SEARCH_MARGIN = 0.25
+# searches between sortings of the particles in space: sums over particles in disorder cost up to half as much again
+_SORT_EVERY = 8
 # support radius of the fetching weight, in spacings
 FETCH_RADIUS = 2.0
 
@@ -83,6 +89,7 @@ class Simulation:
 
     Attributes:
         particles: the flat set of all members, internal units.
+        parameters: the numbers of the scheme in use; see ``change``.
         record: accounts of the run.
         time: present time, s.
     """
@@ -92,22 +99,16 @@ class Simulation:
         self.domain, self.units = simulator.domain, simulator.domain.units
         scene, scheme = simulator.scene, simulator.scheme
         self.record = Record(particles.members, len(scene.valves), particles.position.device)
-        viscosity = scene.fluid.kinematic_viscosity / self.units.kinematic_viscosity
-        sound = scheme.sound_speed / self.units.speed
-        self._coefficients = Coefficients(
-            sound_speed=sound, viscosity=viscosity if scheme.laminar_viscosity and viscosity > 0 else None,
-            artificial=None if not scheme.artificial_viscosity else scheme.artificial_viscosity * sound,
-            smoothing_length=scheme.smoothing_ratio,
-        )
+        self.parameters = Parameters.of(scheme, scene.fluid)
+        self._coefficients = Coefficients.of(self.parameters, self.units, scene.fluid.density)
         self._backend = choose_backend(simulator.backend, simulator.device)
-        search = PairSearch(
-            self._backend, self.domain.support_radius, _SEARCH_MARGIN,
-            self.domain.period,
-        )
+        search = PairSearch(self._backend, self.domain.support_radius, _SEARCH_MARGIN, self.domain.period)
         self._stepper = Stepper(scheme, self._coefficients, search, scene.dimension)
+        self._control = StepControl(self.record, scheme.step_floor)
         self._acceleration = torch.zeros_like(particles.position)
-        self._steps = 0
-        self._last_limit = torch.zeros(particles.members, dtype=torch.float64, device=particles.position.device)
+        self._imposed_at = self.time
+        self._order: Tensor | None = None  # of the particles in space when they were last sorted
+        self._sort_at = 0  # number of searches at which they are sorted again
 
     @property
     def members(self) -> int:
@@ -121,6 +122,8 @@ class Simulation:
         """
         if until < self.time:
             raise ValueError(f"cannot advance backwards, from {self.time} s to {until} s")
+        self._fail_lost()
+        self._sort(self._order)
         longest = (until - self.time) / (self.simulator.scheme.steps_per_frame or 1) / self.units.time
         for stop in self.domain.breaks(self.time, until):
             self.domain.enter(self.time, stop)
@@ -130,79 +133,141 @@ class Simulation:
             self.time = stop
             self.particles = self.domain.finish(self.particles, self.record, stop)
             self._forget_pairs()
+        self._unsort()
         self.record.searches = self._stepper.pair_search.searches
+        self.record.overflows = self._backend.overflows
         self.domain.account(self.particles, self.record, self.time)
+
+    def change(self, **values: float | Sequence[float] | Tensor | None) -> None:
+        """Change parameters from now on: one number for all members, or a row (members,) with one for each.
+
+        Names are those of ``Parameters``; None switches a term off. Raises ValueError where a value cannot be, or
+        where the scheme has no place for it.
+        """
+        scheme = self.simulator.scheme
+        if values.get("xsph") is not None and scheme.xsph is None:
+            raise ValueError("parameter 'xsph' needs a scheme with XSPH, which says of what level and form it is")
+        complete = self.domain.walls is not None and isinstance(scheme.wall, CompleteKernelWall)
+        if "smoothing_ratio" in values and complete:
+            raise ValueError("the tables of a complete-kernel wall are made for the scheme's smoothing_ratio")
+        self.parameters = self.parameters.changed(self.particles.velocity, self.members, **values)
+        self._coefficients = Coefficients.of(self.parameters, self.units, self.simulator.scene.fluid.density)
+        self._stepper.use(self._coefficients)
+        self._stepper.pair_search.radius = self._stepper.support.radius
+        self._forget_pairs()
 
     def _advance_interval(self, stop: float, longest: float) -> None:
         duration = (stop - self.time) / self.units.time
         done = torch.zeros(self.members, dtype=torch.float64, device=self.particles.position.device)
+        options = self.simulator.scheme.rollback
+        checkpoints = None if options is None else Checkpoints(options, self.record)
         while True:
             left = torch.where(self.record.failed, torch.zeros_like(done), duration - done)
-            if not bool((left > 1e-9 * duration).any()):
+            left = torch.where(left > 1e-9 * duration, left, torch.zeros_like(left))
+            if not bool((left > 0).any()):
                 return
-            step = self._time_step(left, longest)
+            if checkpoints is not None:
+                checkpoints.keep(self.particles, self._acceleration, done)
+            self._ramp(done)
+            step = self._control.step(
+                self.particles, self._acceleration, self._stepper.coefficients, left, longest,
+                None if checkpoints is None else checkpoints.factor,
+            )
             self.domain.at(self.time + done * self.units.time)
-            if self._stepper.pair_search.stale(self.particles):
-                before = self.particles.count
-                self.particles, renumbered = self.domain.exchange(self.particles, self.record)
-                if renumbered:
-                    self._forget_pairs()
-                if self.particles.count != before:
-                    self._acceleration = torch.zeros_like(self.particles.position)
-            self._take_step(step.to(self.particles.position.dtype))
-            done = done + step
+            self._refresh_neighbours()
+            done = self._take_step(step, done, checkpoints)
 
-    def _time_step(self, left: Tensor, longest: float) -> Tensor:
-        """Each member's step (members,) float64: the smallest limit, evened out over what is left of the interval."""
-        p = self.particles
-        speed = p.per_member(p.velocity.norm(dim=1), "amax")
-        force = p.per_member(self._acceleration.norm(dim=1), "amax")
-        c = self._coefficients
-        limits = step_limits(
-            speed, force, c.smoothing_length, c.sound_speed, c.viscosity or 0.0, self.simulator.scheme.courant
-        ).double()
-        frame = torch.full_like(limits[:1], longest)
-        active = left > 0
-        smallest, which = torch.cat([self._floored(limits, active), frame]).min(0)
-        self.record.reductions += active & (smallest < 0.99 * self._last_limit)
-        self._last_limit = torch.where(active, smallest, self._last_limit)
-        steps = torch.ceil(left / smallest - 1e-9).clamp_min(1.0)
-        even = torch.where(left > 0, left / steps, torch.zeros_like(left))
-        which = torch.where(steps > 1, which, len(LIMITS) - 1)
-        self.record.limited_by.scatter_add_(1, which[:, None], active[:, None].to(torch.int64))
-        self.record.steps += active
-        mach = speed / c.sound_speed
-        self.record.largest_mach = torch.maximum(self.record.largest_mach, mach.double())
-        return even
+    def _ramp(self, done: Tensor) -> None:
+        """Let gamma grow, where the scheme has it grow."""
+        ramp = self.simulator.scheme.gamma_ramp
+        if ramp is None:
+            return
+        elapsed = self.time - self._imposed_at + done * self.units.time
+        ramped = self._coefficients
+        if bool((elapsed < ramp.duration).any()):
+            ramped = ramped.ramped(ramp, elapsed.to(self.particles.position.dtype))
+        if ramped is not self._stepper.coefficients:
+            self._stepper.use(ramped)
 
-    def _floored(self, limits: Tensor, active: Tensor) -> Tensor:
-        """The limits (3, members), none below the scheme's floor; the record counts where that changed the step."""
-        scheme, c = self.simulator.scheme, self._coefficients
-        if scheme.step_floor is None:
-            return limits
-        floor = scheme.step_floor * scheme.courant * c.smoothing_length / c.sound_speed
-        # the viscous limit is known beforehand and no accident: it stays
-        held = (limits[[0, 2]] < floor).any(0) & (limits[1] > floor)
-        self.record.floored += active & held
-        return torch.stack([limits[0].clamp_min(floor), limits[1], limits[2].clamp_min(floor)])
+    def _refresh_neighbours(self) -> None:
+        """Where the neighbour list is used up: pass particles through valves, and now and then sort them in space."""
+        search = self._stepper.pair_search
+        if not search.stale(self.particles):
+            return
+        before = self.particles.count
+        self.particles, renumbered = self.domain.exchange(self.particles, self.record)
+        if renumbered:
+            self._forget_pairs()
+        if self.particles.count != before:
+            self._acceleration = torch.zeros_like(self.particles.position)
+        if search.searches >= self._sort_at:
+            self._sort(search.spatial_order(self.particles))
+            self._sort_at = search.searches + _SORT_EVERY
 
-    def _take_step(self, step: Tensor) -> None:
-        before = self.particles
-        after, acceleration, wall = self._stepper.step(before, step, self._steps, self.domain)
-        after = self.domain.constrain(before, after, wall, step, self.record)
-        self._steps += 1
-        finite = torch.isfinite(after.position).all(1) & torch.isfinite(after.velocity).all(1)
-        finite &= torch.isfinite(after.deviation)
+    def _sort(self, order: Tensor | None) -> None:
+        """Put the particles into an order (N,) with labels that tell the caller's; nothing where it does not fit."""
+        if order is None or len(order) != self.particles.count:
+            return
+        particles = self.particles if self.particles.label is not None else self.particles.labelled()
+        self.particles = particles.select(order)
+        self._acceleration = self._acceleration[order]
+        self._stepper.pair_search.forget()
+
+    def _unsort(self) -> None:
+        """Back to the caller's order; the order in space is kept for the next time."""
+        label = self.particles.label
+        self._order = None
+        if label is None:
+            return
+        back = torch.argsort(label, stable=True)
+        self._order = torch.argsort(back)
+        self.particles, self._acceleration = self.particles.by_label(), self._acceleration[back]
+
+    def _take_step(self, step: Tensor, done: Tensor, checkpoints: Checkpoints | None) -> Tensor:
+        """Step every member by its own ``step`` (members,); how far each has come in the interval (members,)."""
+        before, push = self.particles, self._acceleration
+        inner = step.to(before.position.dtype)
+        after, acceleration, wall = self._stepper.step(before, inner, self.record.steps, self.domain)
+        after = self.domain.constrain(before, after, wall, inner, self.record)
+        waiting = step == 0
+        if bool(waiting.any()):
+            after, acceleration = _held(waiting, before, after), _held_rows(waiting, before, push, acceleration)
+        self.particles, self._acceleration, done = after, acceleration, done + step
+        lowest, highest = (after.per_member(after.deviation, way) for way in ("amin", "amax"))
+        self.record.note_density(lowest, highest)
+        broken = self._broken(lowest, highest) & ~self.record.failed
+        if bool(broken.any()):
+            done = self._recover(broken, before, push, done, checkpoints)
+        return done
+
+    def _broken(self, lowest: Tensor, highest: Tensor) -> Tensor:
+        """Members (members,) bool with a particle that is not finite, or denser or thinner than a rollback allows."""
+        p, options = self.particles, self.simulator.scheme.rollback
+        broken = torch.zeros_like(self.record.failed)
+        finite = torch.isfinite(p.position).all(1) & torch.isfinite(p.velocity).all(1) & torch.isfinite(p.deviation)
         if not bool(finite.all()):
-            after = self._freeze(before, after, finite)
-            acceleration = torch.nan_to_num(acceleration)
-        self.particles, self._acceleration = after, acceleration
-        lowest = after.per_member(after.deviation, "amin")
-        self.record.note_density(lowest, after.per_member(after.deviation, "amax"))
+            broken = p.per_member((~finite).to(torch.int64), "sum") > 0
+        if options is not None:
+            broken |= (1.0 + lowest < options.density[0]) | (1.0 + highest > options.density[1])
+        return broken
 
-    def _freeze(self, before: Particles, after: Particles, finite: Tensor) -> Particles:
-        """Put members with a non-finite particle back to their last good state, for good."""
-        broken = before.per_member((~finite).to(torch.int64), "sum") > 0
+    def _recover(
+        self, broken: Tensor, before: Particles, push: Tensor, done: Tensor, checkpoints: Checkpoints | None
+    ) -> Tensor:
+        """Put broken members back to their last good state, for another try or for good."""
+        if checkpoints is not None:
+            self.particles, self._acceleration, done, broken = checkpoints.restored(
+                broken, self.particles, self._acceleration, done
+            )
+            self._forget_pairs()
+        else:
+            self._acceleration = _held_rows(broken, before, push, self._acceleration)
+            self.particles = _held(broken, before, self.particles)
+        self._fail(broken)
+        return done
+
+    def _fail(self, broken: Tensor) -> None:
+        """Freeze members for good."""
         self.record.failed |= broken
         if bool(self.record.failed.all()):
             raise NumericalFailure(
@@ -210,13 +275,14 @@ class Simulation:
                 f"{self.time:.6g} s; lower the Courant fraction, raise the sound speed, or check the imposed velocity "
                 f"(largest Mach number {float(self.record.largest_mach.max()):.2f})"
             )
-        back = broken[before.member]
-        keep = {
-            name: torch.where(back.reshape(-1, *[1] * (getattr(after, name).ndim - 1)), getattr(before, name),
-                              getattr(after, name))
-            for name in ("position", "velocity", "deviation")
-        }
-        return after.changed(**keep)
+
+    def _fail_lost(self) -> None:
+        """Freeze members that come with positions that are not finite, so that the others can be searched."""
+        p = self.particles
+        lost = ~torch.isfinite(p.position).all(1)
+        if bool(lost.any()):
+            self._fail(p.per_member(lost.to(torch.int64), "sum") > 0)
+            self.particles = p.changed(position=torch.where(lost[:, None], torch.zeros_like(p.position), p.position))
 
     def _forget_pairs(self) -> None:
         self._stepper.pair_search.forget()
@@ -231,6 +297,7 @@ class Simulation:
             mask: (*shape) bool, where the velocity is known. Beyond it the walls' velocity continues the field.
         """
         self.particles = self.domain.imposed(self.particles, grid, velocity, mask, self.time)
+        self._imposed_at = self.time
         self._forget_pairs()
 
     def pull(self, grid: Grid, target: Tensor, gain: Tensor, weight: Tensor) -> None:
@@ -264,3 +331,15 @@ class Simulation:
         covered[:, node] = found.covered.reshape(self.members, len(node))
         shape = grid.shape
         return Fetched(value.reshape(self.members, dimension, *shape), covered.reshape(self.members, *shape))
+
+
+def _held_rows(members: Tensor, particles: Particles, before: Tensor, after: Tensor) -> Tensor:
+    """``before`` for the particles of some members (members,) bool, ``after`` for the others; (N, ...)."""
+    mine = members[particles.member]
+    return torch.where(mine.reshape(-1, *[1] * (after.ndim - 1)), before, after)
+
+
+def _held(members: Tensor, before: Particles, after: Particles) -> Particles:
+    """``after`` with the state of some members (members,) bool as it was before."""
+    keep = {n: getattr(after, n) for n in ("position", "velocity", "deviation")}
+    return after.changed(**{n: _held_rows(members, after, getattr(before, n), value) for n, value in keep.items()})

@@ -14,19 +14,19 @@ from .smoothing import SmoothingKernel
 LIMITS = ("acoustic", "viscous", "force", "frame", "end of interval")
 
 
-def tait_pressure(deviation: Tensor, sound_speed: float | Tensor, gamma: float) -> Tensor:
+def tait_pressure(deviation: Tensor, sound_speed: float | Tensor, gamma: float | Tensor) -> Tensor:
     """p / rho0 = c^2 / gamma ((1 + d)^gamma - 1) (2.25 without the background), (N,).
 
     gamma = 1 is the linear equation of state; expm1/log1p keep the digits of a small deviation d in float32.
     """
-    if gamma == 1.0:
+    if not isinstance(gamma, Tensor) and gamma == 1.0:
         return sound_speed**2 * deviation
     return sound_speed**2 / gamma * torch.expm1(gamma * torch.log1p(deviation))
 
 
 def step_limits(
-    speed: Tensor, acceleration: Tensor, smoothing_length: float, sound_speed: float | Tensor,
-    viscosity: float | Tensor, courant: float,
+    speed: Tensor, acceleration: Tensor, smoothing_length: float | Tensor, sound_speed: float | Tensor,
+    viscosity: float | Tensor, courant: float | Tensor,
 ) -> Tensor:
     """Acoustic, viscous and force limits (Morris et al. 1997 eqs. 30-32) of each member: (3, members), internal time.
 
@@ -53,8 +53,8 @@ def softened_share(kernel: SmoothingKernel, dimension: int) -> float:
 
 
 def shifting_displacement(
-    particles: Particles, concentration: Tensor, step: Tensor, smoothing_length: float, strength: float,
-    largest: bool = False,
+    particles: Particles, concentration: Tensor, step: Tensor, smoothing_length: float | Tensor,
+    strength: float | Tensor, largest: bool = False,
 ) -> Tensor:
     """Displacement -A h |v| dt grad C that evens out the particles (Lind et al. 2012, speed-limited form), (N, D).
 
@@ -65,7 +65,7 @@ def shifting_displacement(
     speed = particles.velocity.norm(dim=1).clamp_min(_SPEED_FLOOR)
     if largest:
         speed = particles.per_member(speed, "amax").index_select(0, particles.member)
-    amount = strength * smoothing_length * speed * per_particle(step, particles.member)
+    amount = per_particle(strength * smoothing_length, particles.member) * speed * per_particle(step, particles.member)
     shift = -amount[:, None] * concentration
     length = shift.norm(dim=1, keepdim=True)
     return shift * (_SHIFT_CAP / length.clamp_min(_SHIFT_CAP))

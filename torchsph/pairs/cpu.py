@@ -81,11 +81,15 @@ class CpuBackend(PlannedBackend):
             used = int(needed)
             if used <= entries.numel():
                 break
+            self.overflows += 1
             entries = self._room(int(1.1 * used))
         self.entries_per_particle = used / max(position.shape[0], 1)
         pairs = ClusterPairs([slot, owner, entries, offset, home], length, position.shape[0], used)
         weakref.finalize(pairs, _SPARE.append, entries).atexit = False
         return pairs
+
+    def order(self, pairs: ClusterPairs) -> Tensor:
+        return pairs.order
 
     @staticmethod
     def _room(entries: int) -> Tensor:

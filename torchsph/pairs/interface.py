@@ -181,9 +181,14 @@ class Moments:
 
 
 class Backend(ABC):
-    """A way to evaluate the pair sums.  ``pairs`` is whatever ``search`` returned, opaque to the caller."""
+    """A way to evaluate the pair sums.  ``pairs`` is whatever ``search`` returned, opaque to the caller.
+
+    Attributes:
+        overflows: searches that were made again because a list outgrew its room (nothing is ever dropped).
+    """
 
     name: str
+    overflows = 0
 
     @abstractmethod
     def search(
@@ -203,6 +208,10 @@ class Backend(ABC):
         Raises:
             ValueError: a position is not finite, or a period is shorter than three radii.
         """
+
+    def order(self, pairs: Any) -> Tensor | None:
+        """Particle indices (N,) in an order that makes the sums faster; None: it does not matter."""
+        return None
 
     @abstractmethod
     def rates(self, pairs: Any, state: PairState, support: Support, terms: RateTerms) -> Rates:
