@@ -27,8 +27,8 @@ from .units import Units
 
 # how far particles move before the neighbours are searched again, in spacings
 _SEARCH_MARGIN = 0.25
-# searches between sortings of the particles in space: sums over particles in disorder cost up to half as much again
-_SORT_EVERY = 8
+# from so many particles on they are sorted in space, every so many searches: smaller sets fit into the caches anyway
+_SORT_FROM, _SORT_EVERY = 50_000, 8
 # support radius of the fetching weight, in spacings
 FETCH_RADIUS = 2.0
 
@@ -200,7 +200,7 @@ class Simulation:
             self._forget_pairs()
         if self.particles.count != before:
             self._acceleration = torch.zeros_like(self.particles.position)
-        if search.searches >= self._sort_at:
+        if self.particles.count >= _SORT_FROM and search.searches >= self._sort_at:
             self._sort(search.spatial_order(self.particles))
             self._sort_at = search.searches + _SORT_EVERY
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from .interface import PairState, Support, check_search, per_particle
-from .search import _cells, _key, _shifted, nearest_image
+from .search import _key, _shifted, nearest_image, placed_cells
 
 
 def centroid_xsph(state: PairState, support: Support, cell: float, period: Tensor | None = None) -> Tensor:
@@ -28,7 +28,7 @@ def centroid_xsph(state: PairState, support: Support, cell: float, period: Tenso
     count, dimension = state.position.shape
     if count == 0:
         return torch.zeros_like(state.velocity)
-    index, cells = _cells(state.position, cell, period)
+    index, cells, lower, width = placed_cells(state.position, cell, period)
     keys, own = torch.unique(_key(index, state.member, cells), return_inverse=True)
 
     def total(values: Tensor) -> Tensor:
@@ -36,7 +36,6 @@ def centroid_xsph(state: PairState, support: Support, cell: float, period: Tenso
 
     mass, volume = total(state.mass), total(state.volume)
     velocity = total(state.mass[:, None] * state.velocity) / mass[:, None]
-    lower, width = _frame(state.position, cell, period)
     length = per_particle(support.length, state.member)
     pull = torch.zeros_like(state.velocity)
     for offset in itertools.product((-1, 0, 1), repeat=dimension):
@@ -49,14 +48,3 @@ def centroid_xsph(state: PairState, support: Support, cell: float, period: Tenso
         weight = support.kernel.value(distance, length, dimension) * volume[at] * found
         pull = pull + weight[:, None] * (velocity[at] - state.velocity)
     return pull
-
-
-def _frame(position: Tensor, cell: float, period: Tensor | None) -> tuple[Tensor, Tensor]:
-    """Lower corner and edges (D,) of the cells that ``_cells`` counts."""
-    lower, width = position.amin(0), torch.full_like(position[0], cell)
-    if period is not None:
-        periodic = torch.isfinite(period)
-        length = torch.where(periodic, period, torch.ones_like(period)).to(position.dtype)
-        width = torch.where(periodic, length / torch.floor(length / cell).clamp_min(1), width)
-        lower = torch.where(periodic, torch.zeros_like(lower), lower)
-    return lower, width

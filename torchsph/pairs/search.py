@@ -53,23 +53,35 @@ def half_pairs(
 
 
 def _cells(position: Tensor, radius: float, period: Tensor | None) -> tuple[Tensor, Tensor]:
-    """Cell index (N, D) and number of cells (D,) of every axis; periodic axes hold whole cells."""
-    lower = position.amin(0)
-    width = torch.full_like(lower, radius)
+    """Cell index (N, D) and number of cells (D,) of every axis; see ``placed_cells``."""
+    return placed_cells(position, radius, period)[:2]
+
+
+def placed_cells(
+    position: Tensor, edge: float, period: Tensor | None
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Cell index (N, D), number of cells (D,), lower corner of cell 0 (D,), edges (D,); periodic axes hold whole cells.
+
+    Cells begin at whole multiples of their edge wherever the particles are, so that which particles share one, and
+    in what order they are summed, does not depend on the other members of a batch.
+    """
+    width = torch.full_like(position[0], edge)
     if period is not None:
         periodic = torch.isfinite(period)
         length = torch.where(periodic, period, torch.ones_like(period)).to(position.dtype)
-        width = torch.where(periodic, length / torch.floor(length / radius).clamp_min(1), width)
-        wrapped = torch.remainder(position, length)
-        position = torch.where(periodic, wrapped, position)
-        lower = torch.where(periodic, torch.zeros_like(lower), lower)
-    cell = torch.floor((position - lower) / width).to(torch.int64)
+        width = torch.where(periodic, length / torch.floor(length / edge).clamp_min(1), width)
+        position = torch.where(periodic, torch.remainder(position, length), position)
+    cell = torch.floor(position / width).to(torch.int64)
+    lowest = cell.amin(0)
+    if period is not None:
+        lowest = torch.where(periodic, torch.zeros_like(lowest), lowest)
+    cell = cell - lowest
     cells = cell.amax(0) + 1
     if period is not None:
         whole = torch.round(length / width).to(torch.int64)
         cells = torch.where(periodic, whole, cells)
         cell = torch.minimum(cell, cells - 1)  # x just below the period rounds up to it
-    return cell, cells
+    return cell, cells, lowest.to(position.dtype) * width, width
 
 
 def _key(cell: Tensor, member: Tensor, cells: Tensor) -> Tensor:
