@@ -74,6 +74,20 @@ class Particles:
         member = torch.arange(members, device=self.member.device).repeat_interleave(self.count)
         return Particles(**{**copies, "member": member, "label": None}, members=members)
 
+    def with_member(self, member: int, other: Particles) -> tuple[Particles, Tensor]:
+        """Particles whose ``member`` is as in ``other``, and where they come from: rows (N,) of the two joined.
+
+        They stand where they stood if they are as many, else behind the others, whose order stays.
+        """
+        old = torch.nonzero(self.member == member).flatten()
+        new = torch.nonzero(other.member == member).flatten() + self.count
+        rows = torch.arange(self.count, device=self.member.device)
+        if len(old) == len(new):
+            rows[old] = new
+        else:
+            rows = torch.cat([rows[self.member != member], new])
+        return self.joined(other).select(rows), rows
+
     def labelled(self) -> Particles:
         """With labels 0, 1, ... in the present order."""
         return replace(self, label=torch.arange(self.count, device=self.member.device))

@@ -55,11 +55,9 @@ class Checkpoints:
         """Put the members in ``broken`` (members,) bool back to their kept states, with steps half as long.
 
         Returns particles, acceleration (N, D), ``done`` (members,), and the members (members,) bool that have no try
-        left. Particles are renumbered: those of restored members come last.
+        left.
         """
-        given_up = torch.zeros_like(broken)
-        stay = ~broken[particles.member]
-        rest, push, done = particles.select(stay), acceleration[stay], done.clone()
+        given_up, done = torch.zeros_like(broken), done.clone()
         for member in torch.nonzero(broken).flatten().tolist():
             state = self._state[member]
             self._failed_at[member] = max(float(self._failed_at[member]), float(done[member]))
@@ -69,9 +67,9 @@ class Checkpoints:
                 self._record.rollbacks[member] += 1
             else:
                 given_up[member] = True
-            mine = state.particles.member == member
-            rest, push = rest.joined(state.particles.select(mine)), torch.cat([push, state.acceleration[mine]])
+            particles, rows = particles.with_member(member, state.particles)
+            acceleration = torch.cat([acceleration, state.acceleration])[rows]
             done[member] = state.done[member]
             for name, account in state.accounts.items():
                 getattr(self._record, name)[member] = account[member]
-        return rest, push, done, given_up
+        return particles, acceleration, done, given_up

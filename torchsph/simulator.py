@@ -123,7 +123,9 @@ class Simulation:
         if until < self.time:
             raise ValueError(f"cannot advance backwards, from {self.time} s to {until} s")
         self._fail_lost()
-        self._sort(self._order)
+        if self.particles.count >= _SORT_FROM:
+            self.particles = self.particles.labelled()
+            self._sort(self._order)
         longest = (until - self.time) / (self.simulator.scheme.steps_per_frame or 1) / self.units.time
         for stop in self.domain.breaks(self.time, until):
             self.domain.enter(self.time, stop)
@@ -259,7 +261,6 @@ class Simulation:
             self.particles, self._acceleration, done, broken = checkpoints.restored(
                 broken, self.particles, self._acceleration, done
             )
-            self._forget_pairs()
         else:
             self._acceleration = _held_rows(broken, before, push, self._acceleration)
             self.particles = _held(broken, before, self.particles)
