@@ -2,7 +2,7 @@
 
 It assumes the noise of different samples to be independent; where that does not hold (speckle tracking) it
 undersmooths, and the restricted likelihood is the better choice. One noise level serves all components, and
-no_slip stays as given.
+no_slip and divergence stay as given.
 """
 
 from math import exp, log
@@ -12,7 +12,7 @@ from scipy.optimize import minimize_scalar
 
 from .banded import widen
 from .direct import Factor
-from .likelihood import PROBES, SHARPEST, Choice, LikelihoodSearch
+from .likelihood import PROBES, SHARPEST, Choice, LikelihoodSearch, Precisions
 
 
 def cross_validate(search: LikelihoodSearch, no_slip: float | None, rounds: int) -> Choice:
@@ -34,7 +34,8 @@ def cross_validate(search: LikelihoodSearch, no_slip: float | None, rounds: int)
         _, variance, x = _evaluate(search, length, no_slip)
         if not settled:
             search.reweigh(x)
-    return Choice((variance**0.5,) * search.components, length, no_slip, search.factor, count, settled)
+    noise = (variance**0.5,) * search.components
+    return Choice(noise, length, no_slip, None, search.factor, count, settled)
 
 
 def _evaluate(
@@ -44,7 +45,7 @@ def _evaluate(
     one = torch.ones(search.components, dtype=torch.float64)
     scale = search.scale(one)
     slip = 0.0 if search.slip is None or no_slip is None else scale * no_slip**2
-    prior, right = search.prior(one, scale * curvature**4, slip)
+    prior, right = search.prior(Precisions(one, scale * curvature**4, slip, 0.0))
     posterior = Factor(prior + widen(search.data.band, one), search.ordering)
     x = posterior.solve(right + search.data.right)
     used = float((search.data_probes * posterior.solve(search.data_probes)).sum()) / PROBES

@@ -1,8 +1,8 @@
 """Noise levels, smoothness and slip chosen by restricted likelihood, without seeing any truth.
 
 Bayesian reading of the cost: every group of rows is Gaussian with a precision theta of its own: the samples
-of velocity component k (1 / sigma_k^2), the curvature (how rough the flow is), the slip at the wall. The
-restricted likelihood of all of them is maximised by the update of S. Wood and M. Fasiolo, Biometrics 73
+of velocity component k (1 / sigma_k^2), the curvature (how rough the flow is), its divergence, the slip at the
+wall. The restricted likelihood of all of them is maximised by the update of S. Wood and M. Fasiolo, Biometrics 73
 (2017) 1071 (generalised Fellner-Schall), which needs two factorisations and a few traces per round.
 
 Speckle noise is correlated over millimetres, and a likelihood that believes samples to be independent takes
@@ -13,13 +13,14 @@ finer scales, which tells nothing about them, drops out.
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 
 from .banded import multiply, widen
 from .direct import SHIFT, Factor, PreparedSystem
 from .knots import Knots
-from .operators import CellRows, RowBlock, System, VectorRows
+from .operators import CellRows, DivergenceRows, RowBlock, System, VectorRows
 from .ordering import Ordering, order
 from .robust import inflation, robust_weight
 
@@ -31,6 +32,7 @@ SETTLED = 0.03  # a round that changes no precision by more than this fraction e
 FLOOR = 1e-3  # slip precisions below this share of the data's no longer matter
 NOISE_FLOOR = 1e-4  # of the data's root mean square: exact data would send the precision to infinity
 SHARPEST = 0.01  # curvature lengths stay between this many knot spacings and its inverse
+LONGEST = 10.0  # divergence lengths stay below so many sides of the box: divergence-free data want an infinite one
 RIDGE = 0.02  # curvature length, in knot spacings, that keeps the unpenalised fit defined
 
 
@@ -39,14 +41,15 @@ class Choice:
     """What the likelihood chose. Lengths in m, velocities in m/s.
 
     ``noise`` (C): white-equivalent standard deviation, per component, of a sample of full weight (larger than
-    the point-wise one where the noise is correlated). ``curvature``, ``no_slip``: the Smoother's options of
-    that name. ``robust`` (n,): factors on the squared rows of the samples. ``rounds`` used; ``settled``: the
-    last one changed nothing of note.
+    the point-wise one where the noise is correlated). ``curvature``, ``no_slip``, ``divergence``: the Smoother's
+    options of that name (None: none to choose). ``robust`` (n,): factors on the squared rows of the samples.
+    ``rounds`` used; ``settled``: the last one changed nothing of note.
     """
 
     noise: tuple[float, ...]
     curvature: float
     no_slip: float | None
+    divergence: float | None
     robust: torch.Tensor
     rounds: int
     settled: bool
@@ -61,8 +64,39 @@ class Groups:
     weight: torch.Tensor  # (n,) row weights
     curvature: CellRows  # one component
     slip: VectorRows | None  # the wall rows held in full, one weight per row
+    divergence: DivergenceRows | CellRows | None  # only where its strength is to be chosen
     fixed: list[RowBlock]  # divergence and wall rows at the strength the options give
     damping: float  # row factor
+
+
+class Precisions(NamedTuple):
+    """What the search looks for: of the samples' components (C,), curvature, slip and divergence (0: no such rows)."""
+
+    fit: torch.Tensor
+    rough: float
+    slip: float
+    divergence: float
+
+
+class _Coupled:
+    """A group of rows without targets that couple the components."""
+
+    def __init__(self, block: DivergenceRows | CellRows, ordering: Ordering) -> None:
+        self.block, self.ordering = block, ordering
+        self.band = PreparedSystem(System(ordering.knots, block.components, [block], 0.0), ordering).band()
+
+    def probes(self, generator: torch.Generator) -> torch.Tensor:
+        """As :meth:`_Alike.probes`."""
+        draws = []
+        for _ in range(PROBES):
+            signs = torch.randint(0, 2, self.block.target.shape, generator=generator).double() * 2 - 1
+            draws.append(self.block.rmatvec(signs)[self.ordering.nodes])
+        return torch.stack(draws, dim=-1)
+
+    def energy(self, x: torch.Tensor) -> float:
+        """Sum of the squared rows at x (active, C)."""
+        flat = x.reshape(-1, 1)
+        return float((flat * multiply(self.band, flat)).sum())
 
 
 class _Alike:
@@ -107,11 +141,12 @@ class LikelihoodSearch:
     def __init__(self, knots: Knots, groups: Groups, robust: str | None) -> None:
         self.groups, self.robust, self.components = groups, robust, groups.velocity.shape[1]
         fit = VectorRows(knots, groups.points, groups.velocity, groups.weight[:, None])
-        every = [fit, *groups.fixed] + ([] if groups.slip is None else [groups.slip])
+        every = [fit, *groups.fixed, *(rows for rows in (groups.slip, groups.divergence) if rows is not None)]
         self.ordering = order(System(knots, self.components, every, 0.0))
         self.fit, self.step = fit, max(knots.spacing[: self.components])  # m, time left out
         self.curvature = _Alike(groups.curvature, self.ordering)
         self.slip = None if groups.slip is None else _Alike(groups.slip, self.ordering)
+        self.divergence = None if groups.divergence is None else _Coupled(groups.divergence, self.ordering)
         silent = VectorRows(knots, groups.points, groups.velocity, torch.zeros_like(groups.weight)[:, None])
         fixed = System(knots, self.components, [silent, *groups.fixed], groups.damping)
         fixed = PreparedSystem(fixed, self.ordering)
@@ -122,52 +157,60 @@ class LikelihoodSearch:
         self.rough_probes = self.curvature.probes(self.components, generator)
         if self.slip is not None:
             self.slip_probes = self.slip.probes(self.components, generator)
+        if self.divergence is not None:
+            self.divergence_probes = self.divergence.probes(generator)
         self._weigh(torch.ones_like(groups.weight))
         speed = float(groups.velocity.double().square().mean().sqrt())
         self.sharpest = (NOISE_FLOOR * speed) ** -2
+        self.longest = LONGEST * max(h * n for h, n in zip(knots.spacing, knots.cells, strict=True))
 
-    def run(self, noise: float, curvature: float, no_slip: float | None, rounds: int) -> Choice:
-        """Search from a first guess: noise in m/s, curvature in m, no_slip as in the Smoother's options."""
+    def run(
+        self, noise: float, curvature: float, no_slip: float | None, divergence: float | None, rounds: int
+    ) -> Choice:
+        """Search from a first guess: noise in m/s, the others as in the Smoother's options."""
         fit = torch.full((self.components,), noise**-2, dtype=torch.float64)
         scale = self.scale(fit)
-        rough, slip = scale * curvature**4, 0.0
-        if self.slip is not None and no_slip is not None:
-            slip = scale * no_slip**2
-        settled, count = False, 0
+        slip = 0.0 if self.slip is None or no_slip is None else scale * no_slip**2
+        free = 0.0 if self.divergence is None or divergence is None else scale * divergence**2
+        found, settled, count = Precisions(fit, scale * curvature**4, slip, free), False, 0
         while count < rounds and not settled:
             count += 1
-            old = (fit, rough, slip)
-            fit, rough, slip = self._round(fit, rough, slip)
-            settled = self._settled(old, (fit, rough, slip))
-        scale = self.scale(fit)
-        chosen = (slip / scale) ** 0.5 if self.slip is not None and no_slip is not None else None
-        noise_each = tuple((fit**-0.5).tolist())
-        return Choice(noise_each, (rough / scale) ** 0.25, chosen, self.factor, count, settled)
+            old, found = found, self._round(found)
+            settled = self._settled(old, found)
+        scale = self.scale(found.fit)
+        noise_each = tuple((found.fit**-0.5).tolist())
+        no_slip, divergence = ((each / scale) ** 0.5 if each > 0 else None for each in (found.slip, found.divergence))
+        return Choice(noise_each, (found.rough / scale) ** 0.25, no_slip, divergence, self.factor, count, settled)
 
-    def _round(self, fit: torch.Tensor, rough: float, slip: float) -> tuple[torch.Tensor, float, float]:
-        prior, right = self.prior(fit, rough, slip)
-        posterior = Factor(prior + widen(self.data.band, fit), self.ordering)
+    def _round(self, now: Precisions) -> Precisions:
+        prior, right = self.prior(now)
+        posterior = Factor(prior + widen(self.data.band, now.fit), self.ordering)
         prior = Factor(prior, self.ordering)
-        x = posterior.solve(right + fit * self.data.right)
-        new_fit = self._noise(x, fit, posterior)
-        low, high = (self.scale(fit) * (factor * self.step) ** 4 for factor in (SHARPEST, 1 / SHARPEST))
-        rough *= self._step(prior, posterior, self.rough_probes, self.curvature.energy(x))
-        rough = min(max(rough, low), high)
+        x = posterior.solve(right + now.fit * self.data.right)
+        new_fit, scale = self._noise(x, now.fit, posterior), self.scale(now.fit)
+        low, high = (scale * (factor * self.step) ** 4 for factor in (SHARPEST, 1 / SHARPEST))
+        rough = now.rough * self._step(prior, posterior, self.rough_probes, self.curvature.energy(x))
+        rough, slip, free = min(max(rough, low), high), now.slip, now.divergence
         if slip > 0:
             slip *= self._step(prior, posterior, self.slip_probes, self.slip.energy(x))
-            slip = min(slip, self.scale(fit) / SHARPEST**2)
+            slip = min(slip, scale / SHARPEST**2)
+        if free > 0:
+            free *= self._step(prior, posterior, self.divergence_probes, self.divergence.energy(x))
+            free = min(free, scale * self.longest**2)
         if self.robust is not None:
             self.reweigh(x)
-        return new_fit, rough, slip
+        return Precisions(new_fit, rough, slip, free)
 
-    def prior(self, fit: torch.Tensor, rough: float, slip: float) -> tuple[torch.Tensor, torch.Tensor]:
+    def prior(self, now: Precisions) -> tuple[torch.Tensor, torch.Tensor]:
         """Band and right-hand side of all penalties."""
-        scale, one = self.scale(fit), torch.ones(self.components, dtype=torch.float64)
-        prior = scale * self.fixed + widen(self.curvature.band, rough * one)
+        scale, one = self.scale(now.fit), torch.ones(self.components, dtype=torch.float64)
+        prior = scale * self.fixed + widen(self.curvature.band, now.rough * one)
         right = scale * self.fixed_right
-        if slip > 0:
-            prior += widen(self.slip.band, slip * one)
-            right = right + slip * self.slip.right
+        if now.slip > 0:
+            prior += widen(self.slip.band, now.slip * one)
+            right = right + now.slip * self.slip.right
+        if now.divergence > 0:
+            prior.add_(self.divergence.band, alpha=now.divergence)
         # stiff penalties over a breath of damping may lose definiteness to round-off
         prior[:, 0] += SHIFT * prior[:, 0].max()
         return prior, right
@@ -216,8 +259,9 @@ class LikelihoodSearch:
         self.data_probes = factor.spread(self.signs).view(len(probe), self.components, PROBES)
 
     @staticmethod
-    def _settled(old: tuple, new: tuple) -> bool:
-        fit = float(((new[0] - old[0]) / old[0]).abs().max())
-        rough = abs(new[1] / old[1] - 1.0)
-        slip = abs(new[2] - old[2]) / (old[2] + FLOOR * old[1] + 1e-300)
-        return max(fit, rough, slip) < SETTLED
+    def _settled(old: Precisions, new: Precisions) -> bool:
+        fit = float(((new.fit - old.fit) / old.fit).abs().max())
+        rough = abs(new.rough / old.rough - 1.0)
+        slip = abs(new.slip - old.slip) / (old.slip + FLOOR * old.rough + 1e-300)
+        free = abs(new.divergence - old.divergence) / (old.divergence + 1e-300)
+        return max(fit, rough, slip, free) < SETTLED

@@ -1,5 +1,6 @@
 """The automatic choice for one set of samples: row groups on a coarser grid, and the search on them."""
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import torch
@@ -7,7 +8,7 @@ import torch
 from .gcv import cross_validate
 from .knots import Knots
 from .likelihood import Choice, Groups, LikelihoodSearch
-from .operators import CellRows, VectorRows
+from .operators import CellRows, DivergenceRows, VectorRows
 from .penalties import row_factor
 from .rows import penalty_blocks, smoothness_gram, wall_roots
 from .samples import FitData
@@ -31,17 +32,22 @@ def choose(options: "Smoother", knots: Knots, data: FitData) -> Choice | None:
     upper = [o + h * n for o, h, n in zip(knots.origin, knots.spacing, knots.cells, strict=True)]
     coarse = Knots.covering(knots.origin, upper, spacing, knots.degree)
     fit = VectorRows(coarse, data.points, data.velocity, data.weight[:, None])
-    blocks, cells, damping = penalty_blocks(options.fixed(no_slip=None, curvature=None), coarse, data, [fit])
+    rest = options.fixed(no_slip=None, curvature=None, choose_divergence=False)
+    free = options.choose_divergence and bool(options.divergence)
+    rest = replace(rest, divergence=1.0) if free else rest
+    blocks, cells, damping = penalty_blocks(rest, coarse, data, [fit])
+    chosen = [block for block in blocks if free and isinstance(block, DivergenceRows | CellRows)]
     slip = None
     if options.no_slip and data.wall is not None and bool(data.wall.no_slip.any()):
         wall, held = data.wall, data.wall.no_slip
         slip = VectorRows(coarse, wall.points[held], wall.velocity[held], wall_roots(wall)[held, None])
     factor = row_factor(smoothness_gram(options, coarse, data)) / data.extent(coarse) ** 0.5
     groups = Groups(
-        data.points, data.velocity, data.weight, CellRows(coarse, cells, factor, 1), slip, blocks, damping
+        data.points, data.velocity, data.weight, CellRows(coarse, cells, factor, 1), slip,
+        chosen[0] if chosen else None, [block for block in blocks if block not in chosen], damping,
     )
     search = LikelihoodSearch(coarse, groups, options.robust)
     with torch.no_grad():
         if options.automatic == "gcv":
             return cross_validate(search, options.no_slip, options.rounds)
-        return search.run(guess, options.curvature, options.no_slip, options.rounds)
+        return search.run(guess, options.curvature, options.no_slip, options.divergence, options.rounds)

@@ -55,7 +55,9 @@ class Smoother:
     component from the data (see ``likelihood``), "gcv" curvature alone, believing all samples independent
     (see ``gcv``); the values given here are then the first guess, and are kept where fewer than 30 samples,
     or samples of no flow, leave nothing to choose from (``field.choice`` is None there). ``robust``: "tukey"
-    or "huber" reweighting of outliers, found together with that choice.
+    or "huber" reweighting of outliers, found together with that choice. ``choose_divergence``: the likelihood
+    chooses divergence too. Only for samples of independent errors: the likelihood takes the divergence of
+    errors that are correlated over millimetres (speckle tracking) for flow, and settles on too weak a penalty.
     ``search_knots``: the choice is made on a grid this many times coarser, in at most ``rounds`` rounds.
     ``solver``: "direct" (what "auto" picks), "direct32" (a float32 factor, refined to the tolerance: half the
     time on large grids), "lsqr", "lsmr", or "pcg" with a neighbouring frame's factor;
@@ -76,6 +78,7 @@ class Smoother:
     power: float = 1.0
     automatic: str | None = "likelihood"
     robust: str | None = "tukey"
+    choose_divergence: bool = False
     search_knots: float = 4 / 3
     rounds: int = 12
     scaling: str = "density"
@@ -113,6 +116,8 @@ class Smoother:
             raise InvalidInput("automatic choice needs scaling='density' and a curvature > 0 to start from")
         if self.robust and not self.automatic:
             raise InvalidInput("robust reweighting runs within the automatic choice: set robust=None")
+        if self.choose_divergence and (self.automatic != "likelihood" or not self.divergence):
+            raise InvalidInput("choose_divergence needs automatic='likelihood' and a divergence > 0 to start from")
 
     @classmethod
     def preset(cls, name: str, **changes: object) -> "Smoother":
@@ -138,7 +143,7 @@ class Smoother:
 
     def fixed(self, **changes: object) -> "Smoother":
         """The same options without automatic choice and reweighting, with ``changes``."""
-        return replace(self, automatic=None, robust=None, **changes)
+        return replace(self, **{"automatic": None, "robust": None, "choose_divergence": False} | changes)
 
     def fit(
         self,
@@ -234,7 +239,9 @@ class Smoother:
     def _with_choice(self, knots: Knots, data: FitData, choice: Choice) -> Problem:
         stretch = choice.curvature / self.curvature
         in_time = None if self.time_curvature is None else stretch * self.time_curvature
-        options = self.fixed(curvature=choice.curvature, time_curvature=in_time, no_slip=choice.no_slip)
+        free = self.divergence if choice.divergence is None else choice.divergence
+        chosen = {"curvature": choice.curvature, "no_slip": choice.no_slip, "divergence": free}
+        options = self.fixed(time_curvature=in_time, **chosen)
         data = data.reweighed(choice)
         return Problem(data, build_system(options, knots, data), choice)
 

@@ -32,29 +32,45 @@ def test_variance_equals_dense_inverse(axes, degree):
     assert torch.allclose(Posterior(factor, 4.0, axes).variance(points), expected / 4.0, rtol=1e-9)
 
 
+def simulated(options, points, noise, count, generator):
+    """(exact, measured) velocities of ``count`` fields drawn from the prior that ``options`` stand for."""
+    data = FitData.checked(points, torch.zeros_like(points), None, None, None, None, 1.0)
+    knots = knots_for(data, options)
+    blocks = build_system(options, knots, data)
+    silent = blocks.blocks[0].with_weight(0.0)
+    prior = PreparedSystem(System(knots, 3, [silent, *blocks.blocks[1:]], blocks.damping))
+    drawn_from = prior.factor()
+    for _ in range(count):
+        truth = prior.expand(drawn_from.sample(len(points) / noise**2, generator))
+        cell, t = knots.locate(points)
+        exact = torch.einsum("nl,nlc->nc", knots.stencil(t), truth[knots.local_nodes(cell)])
+        yield exact, exact + noise * torch.randn(exact.shape, generator=generator, dtype=torch.float64)
+
+
 def test_z_scores_on_data_simulated_from_the_model():
     """Fields drawn from the prior, noisy samples of them: (fit - truth) / std has standard deviation 1."""
     generator = torch.Generator().manual_seed(0)
     points = torch.rand(800, 3, generator=generator, dtype=torch.float64) * 15e-3
     options = Smoother(divergence=5e-3, curvature=1.5e-3, damping=0.05, wall=None, no_slip=None, **SMALL)
-    data = FitData.checked(points, torch.zeros_like(points), None, None, None, None, 1.0)
-    knots = knots_for(data, options)
-    noise = 0.2
-    precision = len(points) / noise**2
-    blocks = build_system(options, knots, data)
-    silent = blocks.blocks[0].with_weight(0.0)
-    prior = PreparedSystem(System(knots, 3, [silent, *blocks.blocks[1:]], blocks.damping))
-    z, drawn_from = [], prior.factor()
-    for _ in range(6):
-        draw = drawn_from.sample(precision, generator)
-        truth = torch.zeros(knots.nodes, 3, dtype=torch.float64)
-        truth[prior.ordering.nodes] = draw
-        cell, t = knots.locate(points)
-        exact = torch.einsum("nl,nlc->nc", knots.stencil(t), truth[knots.local_nodes(cell)])
-        measured = exact + noise * torch.randn(exact.shape, generator=generator, dtype=torch.float64)
+    z = []
+    for exact, measured in simulated(options, points, 0.2, 6, generator):
         field = options.fit(points, measured, uncertainty=True)
         z.append((field(points) - exact) / field.std(points))
     assert float(torch.cat(z).std()) == pytest.approx(1.0, abs=0.1)
+
+
+@pytest.mark.parametrize("divergence", [1e-3, 4e-3])
+def test_the_likelihood_recovers_noise_curvature_and_divergence_of_simulated_data(divergence):
+    generator = torch.Generator().manual_seed(0)
+    points = torch.rand(2000, 3, generator=generator, dtype=torch.float64) * 17e-3
+    same = {"damping": 0.05, "wall": None, "no_slip": None, "robust": None}
+    truth = Smoother(divergence=divergence, curvature=0.6e-3, automatic=None, **same)
+    ((_, measured),) = simulated(truth, points, 0.05, 1, generator)
+    blind = Smoother(choose_divergence=True, search_knots=1.0, rounds=30, **same)  # starts from the defaults
+    choice = blind.fit(points, measured).choice
+    assert choice.settled and choice.noise == pytest.approx((0.05,) * 3, rel=0.1)
+    assert choice.curvature == pytest.approx(0.6e-3, rel=0.05)
+    assert choice.divergence == pytest.approx(divergence, rel=0.3)
 
 
 def test_z_scores_with_everything_chosen_from_the_data():

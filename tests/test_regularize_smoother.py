@@ -235,6 +235,8 @@ def test_nan_is_allowed_only_under_zero_weight():
         ({"nodes": (8, 8, 8)}, "exactly one"),
         ({"power": -1.0}, "power"),
         ({"tolerance": 0.0}, "tolerance"),
+        ({"automatic": "gcv", "choose_divergence": True}, "choose_divergence"),
+        ({"divergence": None, "choose_divergence": True}, "choose_divergence"),
     ],
 )
 def test_bad_options_are_named(change, word):
