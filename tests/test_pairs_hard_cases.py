@@ -91,6 +91,15 @@ class TestArrangements:
         crowd = 0.3 * torch.rand((400, dimension), generator=generator, dtype=torch.float64).to(dtype)
         check(either, random_state(torch.cat([disordered(6, dimension, dtype).position, crowd])))
 
+    def test_spacings_of_one_to_ten(self, either, dimension, dtype):
+        """A disordered patch ten times finer, its particles as much lighter, in a disordered coarse lattice."""
+        coarse, fine = disordered(6, dimension, dtype, seed=1), disordered(6, dimension, dtype, seed=2)
+        outside = (coarse.position - coarse.position.mean(0)).abs().amax(1) > 0.8
+        patch = coarse.position.mean(0) + 0.1 * (fine.position - fine.position.mean(0))
+        state = random_state(torch.cat([coarse.position[outside], patch]))
+        small = torch.arange(state.position.shape[0]) >= int(outside.sum())
+        check(either, dataclasses.replace(state, mass=torch.where(small, 0.1**dimension, 1.0).to(dtype)))
+
     def test_vacuum_between_two_clouds(self, either, dimension, dtype):
         position = disordered(5, dimension, dtype).position
         check(either, random_state(torch.cat([position, position + 50.0, position - 31.0])))

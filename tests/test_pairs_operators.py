@@ -230,6 +230,37 @@ class TestChoice:
 
 
 @needs_cpu
+def test_an_instruction_set_that_this_processor_lacks(monkeypatch):
+    """Forced by name it is refused with the cure; left alone the next best library is taken."""
+    load = native._load
+
+    class Poor:
+        """A library that says of this processor that it runs the baseline only."""
+
+        def __init__(self, path):
+            self._library = load(path)
+
+        def __getattr__(self, name):
+            return getattr(self._library, name)
+
+        @staticmethod
+        def sph_runs(name):
+            return name == b"baseline"
+
+    monkeypatch.setattr(native, "_load", Poor)
+    native.library.cache_clear()
+    try:
+        assert backend("auto").instruction_set == "baseline"
+        monkeypatch.setenv(native.FORCED, "avx512")
+        native.library.cache_clear()
+        with pytest.raises(ValueError, match="TORCHSPH_ISA=avx512 asks for instructions that this processor lacks"):
+            backend("cpu")
+    finally:
+        monkeypatch.undo()
+        native.library.cache_clear()
+
+
+@needs_cpu
 @pytest.mark.parametrize("instruction_set", native.PREFERENCE)
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_every_instruction_set_equals_the_reference(instruction_set, dtype, monkeypatch):
