@@ -5,9 +5,11 @@ import pytest
 import torch
 
 import geometry
+from torchsph import wall_closest
 from torchsph.schemes import CompleteKernelWall, PotentialWall
 from torchsph.smoothing import kernel
-from torchsph.wallfield import WallFields, kernel_share
+from torchsph.wall_share import KernelShare
+from torchsph.wallfield import WallFields
 from torchsph.walls import WallSample, potential, potential_force, retardation
 
 WENDLAND = kernel("wendland_c2")
@@ -25,13 +27,17 @@ def half_space_share(distance, h):
     return float(torch.trapezoid(slices * keep, x)), float(np.interp(distance, x.numpy(), slices.numpy()))
 
 
+def kernel_share(field, step, h):
+    return KernelShare(field.shape, step, WENDLAND, h, torch.float64).at(field)
+
+
 @pytest.mark.parametrize("distance", [0.0, 0.4, 1.0, 2.0])
 def test_share_behind_a_plane_equals_the_analytic_half_space_integral(distance):
     """Share within 1 %, its gradient within 2 % of the largest slope, at the look-up spacing of the simulator."""
     h, step = 1.3, 0.5
     z = torch.arange(-6.0, 6.0 + step, step, dtype=torch.float64) + 0.13
     field = z[:, None, None].expand(-1, 9, 9)  # distance from the plane z = 0
-    share, gradient = kernel_share(field, step, WENDLAND, h)
+    share, gradient = kernel_share(field, step, h)
     at = int((z - distance).abs().argmin())
     expected, slope = half_space_share(float(z[at]), h)
     assert float(share[0, at, 4, 4]) == pytest.approx(expected, abs=0.01)
@@ -48,7 +54,7 @@ def test_share_in_a_right_angled_edge_is_a_quarter():
     inside = torch.minimum(x, z)
     beyond = -torch.sqrt(x.clamp_max(0) ** 2 + z.clamp_max(0) ** 2)
     field = torch.where(inside > 0, inside, beyond).expand(-1, 9, -1)
-    share, _ = kernel_share(field, step, WENDLAND, h)
+    share, _ = kernel_share(field, step, h)
     corner = int((axis == 0).nonzero())
     assert float(share[0, corner, 4, corner]) == pytest.approx(0.25, abs=0.03)
     assert float(share[0, -1, 4, -1]) == pytest.approx(1.0, abs=1e-9)
@@ -122,3 +128,48 @@ def test_an_open_orifice_is_no_wall():
     assert float(made.sample(made.between(opened, opened), zero, centre).share) > 0.9 > float(
         made.sample(made.between(shut, shut), zero, centre).share
     )
+
+
+def folded_sheet():
+    """A ventricle that moves unevenly, and its vertices' velocities: faces of many sizes and directions."""
+    surface = geometry.Ventricle().surface(1.2e-3)
+    return surface, np.stack([np.sin(400 * surface.vertices[:, k]) for k in range(3)], 1)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_compiled_closest_points_equal_those_of_the_tree(dimension):
+    """Exactly where the distance is below the limit, and a bound from above that is no worse beyond it."""
+    if dimension == 3:
+        surface, values = folded_sheet()
+        grid = geometry.Grid.covering(surface.vertices.min(0) - 4e-3, surface.vertices.max(0) + 4e-3, 1e-3)
+        limit = np.full(grid.size, 3e-3)
+    else:
+        surface = geometry.polygon(np.array([[0, 0], [1, -0.1], [1.2, 1], [0.5, 0.3], [0.1, 0.8]]), 0.07)
+        values = surface.vertices**2
+        grid = geometry.Grid.covering((-0.3, -0.4), (1.5, 1.3), 0.03)
+        limit = np.full(grid.size, 0.2)
+    library = wall_closest.library().handle
+    distance, carried = wall_closest._compiled(library, grid, surface, values, limit)
+    expected, wanted = wall_closest.closest_by_tree(grid, surface, values, limit)
+    true = wall_closest.SurfaceIndex(surface).query(grid.nodes().numpy())
+    within = true.distance < limit
+    assert 0.1 < within.mean() < 0.9
+    np.testing.assert_allclose(distance[within], true.distance[within], rtol=1e-12, atol=1e-15)
+    np.testing.assert_allclose(expected[within], true.distance[within], rtol=1e-12, atol=1e-15)
+    apart = np.abs(carried - wanted)[within].max(1)
+    assert (apart < 1e-9).mean() > 0.98  # nodes as far from two faces as from each other may take either
+    beyond = ~within
+    assert (distance[beyond] >= true.distance[beyond] * (1 - 1e-12)).all()
+    assert (distance[beyond] - true.distance[beyond]).max() < 0.5 * limit[0]
+
+
+def test_without_compiled_code_the_fields_are_the_same(monkeypatch):
+    compiled = fields(geometry.box((0, 0, 0), (0.02, 0.012, 0.012), 2e-3)).key(0, ())
+
+    def missing():
+        raise wall_closest.LibraryMissing
+
+    monkeypatch.setattr(wall_closest, "library", missing)
+    plain = fields(geometry.box((0, 0, 0), (0.02, 0.012, 0.012), 2e-3)).key(0, ())
+    near = compiled[0].abs() < 1.5
+    torch.testing.assert_close(compiled[:, near], plain[:, near], atol=1e-9, rtol=0)

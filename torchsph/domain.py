@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import bisect
-
 import torch
 from torch import Tensor
 
@@ -101,7 +99,7 @@ class Domain:
         """The times in (start, stop] at which members meet: key frames, valve events, and ``stop``."""
         times = {stop}
         if self.walls is not None:
-            times.update(float(t) for t in self.walls.motion.time)
+            times.update(self.walls.moments.within(start, stop))
         if self.scheme.valve is not None:
             times.update(t for valve in self.scene.valves for t in valve.events())
         tolerance = 1e-9 * max(1.0, abs(stop))
@@ -116,10 +114,8 @@ class Domain:
             self._open = tuple(v.region for v in self.scene.valves if v.is_open(middle))
         self.middle = middle  # s, of the present interval
         if self.walls is not None:
-            times = self.walls.motion.time
-            late = min(max(bisect.bisect_left(times, middle), 1), len(times) - 1) if len(times) > 1 else 0
-            early = max(late - 1, 0)
-            self._bracket = (float(times[early]), float(times[late]))
+            early, late, *bracket = self.walls.moments.bracket(middle)
+            self._bracket = (bracket[0], bracket[1])
             keys = (self.walls.key(early, self._open), self.walls.key(late, self._open))
             if self._keys is None or keys[0] is not self._keys[0] or keys[1] is not self._keys[1]:
                 self._keys, self._fields = keys, self.walls.between(*keys)

@@ -55,6 +55,18 @@ typedef struct { /* moments of a first-order moving-least-squares fetch; see int
   void *count, *value, *first, *second, *field, *field_first;
 } sph_interpolation;
 
+typedef struct { /* closest surface points of the nodes of a regular grid, x fastest; see closest.cpp */
+  int32_t dimension, threads;
+  int64_t faces;
+  const double* vertices;  /* (vertices, dimension) */
+  const double* values;    /* (vertices, dimension), linear on each face */
+  const int32_t* corners;  /* (faces, dimension) */
+  double origin[3], step;
+  int64_t counts[3];       /* nodes along x, y, z */
+  const double* limit;     /* (nodes,) distance up to which the closest point is wanted exactly */
+  double *distance, *carried; /* (nodes,) and (nodes, dimension): the values at the closest point */
+} sph_closest;
+
 #ifdef __cplusplus
 extern "C" {
 #endif
@@ -67,6 +79,7 @@ int sph_pass_f32(const sph_pass*);
 int sph_pass_f64(const sph_pass*);
 int64_t sph_interpolate_f32(const sph_interpolation*); /* number of unusable particles and queries; 0: done */
 int64_t sph_interpolate_f64(const sph_interpolation*);
+void sph_grid_closest(const sph_closest*);
 int sph_runs(const char* instruction_set);             /* whether this processor has it */
 double sph_fma(int threads, int64_t turns, float factor); /* float32 multiply-adds; the flop done */
 #pragma GCC visibility pop

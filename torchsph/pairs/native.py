@@ -111,6 +111,25 @@ class InterpolationArguments(ctypes.Structure):
     ]
 
 
+class ClosestArguments(ctypes.Structure):
+    """sph_closest of csrc/interface.h."""
+
+    _fields_ = [
+        ("dimension", _int),
+        ("threads", _int),
+        ("faces", _long),
+        ("vertices", _pointer),
+        ("values", _pointer),
+        ("corners", _pointer),
+        ("origin", _real * 3),
+        ("step", _real),
+        ("counts", _long * 3),
+        ("limit", _pointer),
+        ("distance", _pointer),
+        ("carried", _pointer),
+    ]
+
+
 @dataclass(frozen=True)
 class Library:
     """A loaded library and the instruction set it was compiled for."""
@@ -184,5 +203,6 @@ def _declare(handle: ctypes.CDLL) -> ctypes.CDLL:
         getattr(handle, f"sph_pass_{reals}").argtypes = [ctypes.POINTER(PassArguments)]
         interpolate = getattr(handle, f"sph_interpolate_{reals}")
         interpolate.argtypes, interpolate.restype = [ctypes.POINTER(InterpolationArguments)], _long
+    handle.sph_grid_closest.argtypes, handle.sph_grid_closest.restype = [ctypes.POINTER(ClosestArguments)], None
     handle.sph_fma.argtypes, handle.sph_fma.restype = [_int, _long, ctypes.c_float], _real
     return handle
