@@ -114,11 +114,15 @@ class TestTerms:
             period = torch.full((dimension,), 20.0 if dimension == 2 else 8.0, dtype=dtype)
         fields = torch.cat([state.velocity, state.mass[:, None], state.pressure[:, None]], 1)
         query, member = state.position[::3] + 0.3, state.member[::3]
-        got = fast.interpolate(state.position, state.member, fields, lengths, query, member, period=period)
-        wanted = REFERENCE.interpolate(
-            wide.position, wide.member, fields.double(), lengths, query.double(), member, period=period
-        )
-        assert_close(got, wanted, dtype)
+        for weight in (None, (state.mass - 1.02).clamp_min(0.0)):
+            got = fast.interpolate(
+                state.position, state.member, fields, lengths, query, member, period=period, weight=weight
+            )
+            wanted = REFERENCE.interpolate(
+                wide.position, wide.member, fields.double(), lengths, query.double(), member, period=period,
+                weight=None if weight is None else weight.double(),
+            )
+            assert_close(got, wanted, dtype)
 
 
 @pytest.mark.parametrize("dtype", DTYPES)

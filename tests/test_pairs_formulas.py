@@ -137,6 +137,21 @@ def test_moments_of_an_interpolation(problem):
     close(got.field_first, d.each(lambda a, b: d.w[a, b] * np.outer(s[a, b], d.v[b])))
 
 
+def test_moments_of_a_weighted_interpolation(problem):
+    """A weight multiplies the particle's kernel in every moment; weightless particles are not counted."""
+    state, choice, _, d = problem
+    weight = (state.mass - 1.03).clamp_min(0.0)
+    got = REFERENCE.interpolate(
+        state.position, state.member, state.velocity, choice, state.position, state.member, weight=weight
+    )
+    s, w = -d.gap, d.w * weight.numpy()
+    close(got.count, (w > 0).sum(1))
+    close(got.value, d.each(lambda a, b: w[a, b]))
+    close(got.second, d.each(lambda a, b: w[a, b] * np.outer(s[a, b], s[a, b])))
+    close(got.field, d.each(lambda a, b: w[a, b] * d.v[b]))
+    close(got.field_first, d.each(lambda a, b: w[a, b] * np.outer(s[a, b], d.v[b])))
+
+
 def test_corrections(problem):
     state, choice, pairs, d = problem
     terms = RateTerms(None, gradient=True, corrected_diffusion=True, moments=True)

@@ -193,9 +193,9 @@ def test_centroid_xsph_of_a_step_is_its_formula(level):
         ends.append(run.particles)
     without, with_it = ends
     # 1.5 cells hold the support of 2.6 spacings: 14 / (2.6 / 1.5) = 8 whole cells
-    there = without.position if level == "velocity" else position
+    p = without if level == "velocity" else start
     pull = centroid_pull(
-        torch.remainder(there, 14).numpy(), without.velocity.numpy(), 1 / (1 + without.deviation).numpy(), 14.0, 8, 1.3
+        torch.remainder(p.position, 14).numpy(), p.velocity.numpy(), 1 / (1 + p.deviation).numpy(), 14.0, 8, 1.3
     )
     if level == "velocity":
         np.testing.assert_allclose((with_it.velocity - without.velocity).numpy(), 0.3 * pull, atol=1e-12)

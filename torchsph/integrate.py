@@ -93,7 +93,7 @@ class Stepper:
     ) -> tuple[Particles, Tensor, WallSample | None]:
         """Both passes at the same position; velocity first, then position (symplectic Euler)."""
         dt = per_particle(step, particles.member)
-        wall = around.sample(particles)
+        wall, seen = around.sample(particles), particles
         pairs = self.pair_search.at(particles)
         filtering = self._filter_due(number, step)
         terms = self._rate_terms if filtering is None else replace(self._rate_terms, shepard=True)
@@ -104,16 +104,20 @@ class Stepper:
         fluid = particles.fluid[:, None]
         velocity = torch.where(fluid, particles.velocity + dt[:, None] * acceleration, particles.velocity)
         particles = self.retarded(particles.changed(velocity=velocity), wall, dt)
-        drift = dt[:, None] * particles.velocity + self.wandering(particles, rates, crowding, step)
+        drift = dt[:, None] * particles.velocity + self.wandering(particles, rates, crowding, step, seen)
         return particles.changed(position=particles.position + drift), acceleration, wall
 
-    def wandering(self, particles: Particles, rates: Rates, crowding: Tensor | None, step: Tensor) -> Tensor:
-        """What moves particles in a step beside their velocity: position XSPH and shifting, (N, D)."""
+    def wandering(
+        self, particles: Particles, rates: Rates, crowding: Tensor | None, step: Tensor, seen: Particles
+    ) -> Tensor:
+        """What moves particles in a step beside their velocity: position XSPH and shifting, (N, D).
+
+        ``seen`` is the state that the rates belong to.
+        """
         drift = torch.zeros_like(particles.position)
         if self.position_xsph is not None:
             share = per_particle(step * self.position_xsph, particles.member)
-            pull = self._centroid_pull(particles) if self._centroid else rates.xsph
-            drift = drift + share[:, None] * pull
+            drift = drift + share[:, None] * self._pull(seen, rates.xsph)
         if crowding is not None:
             drift = drift + shifting_displacement(
                 particles, crowding, step, self.coefficients.smoothing_length, self.coefficients.shifting,
@@ -121,10 +125,21 @@ class Stepper:
             )
         return torch.where(particles.fluid[:, None], drift, torch.zeros_like(drift))
 
-    def _centroid_pull(self, particles: Particles) -> Tensor:
-        """XSPH by the centroids of cells (N, D); 1.5 cells reach as far as the kernel, so adjacent cells hold all."""
-        cell = self.support.radius / 1.5
-        return centroid_xsph(self._pressureless(particles), self.support, cell, self.pair_search.period)
+    def _pull(self, particles: Particles, plain: Tensor | None) -> Tensor:
+        """XSPH's sum (N, D), ``plain`` where it is the full one without confidences.
+
+        A confidence multiplies the mass of a neighbour (thesis 5.2: "the correlation could be encoded in the mass").
+        """
+        if not self._centroid and particles.confidence is None:
+            return plain
+        state = self._pressureless(particles)
+        if particles.confidence is not None:
+            state = replace(state, mass=state.mass * particles.confidence)
+        if self._centroid:
+            # 1.5 cells reach as far as the kernel, so that adjacent cells hold all of it
+            return centroid_xsph(state, self.support, self.support.radius / 1.5, self.pair_search.period)
+        search = self.pair_search
+        return search.backend.rates(search.at(particles), state, self.support, RateTerms(None, xsph=True)).xsph
 
     def evaluate_rates(self, particles: Particles, pairs: Any, wall: WallSample | None) -> RateSums:
         """Density rate and its companions at one state."""
@@ -154,13 +169,12 @@ class Stepper:
         filtering = self._filter_due(number, step)
         smoothing = self.velocity_xsph is not None
         if smoothing or filtering is not None:
-            wanted = RateTerms(
-                continuity=None, xsph=smoothing and not self._centroid, shepard=filtering is not None
-            )
+            plain = smoothing and not self._centroid and particles.confidence is None
+            wanted = RateTerms(continuity=None, xsph=plain, shepard=filtering is not None)
             state = particles
             sums = backend.rates(pairs, self._pressureless(state), self.support, wanted)
             if smoothing:
-                pull = self._centroid_pull(state) if self._centroid else sums.xsph
+                pull = self._pull(state, sums.xsph)
                 share = per_particle(self.velocity_xsph, particles.member)
                 share = share[:, None] if isinstance(share, Tensor) else share
                 particles = particles.changed(velocity=particles.velocity + share * pull)

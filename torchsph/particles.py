@@ -24,6 +24,7 @@ class Particles:
         kind: (N,) int64, FLUID, or RESERVOIR + v for a particle of the buffer of valve v.
         members: B.
         label: (N,) int64, a numbering that survives sorting, or None.
+        confidence: (N,), not negative, what a particle's velocity counts for in XSPH and in fetching; None: all alike.
     """
 
     position: Tensor
@@ -34,6 +35,7 @@ class Particles:
     kind: Tensor
     members: int
     label: Tensor | None = None
+    confidence: Tensor | None = None
 
     @property
     def count(self) -> int:
@@ -59,11 +61,13 @@ class Particles:
         return replace(self, **{name: value[keep] for name, value in self._arrays().items()})
 
     def joined(self, other: Particles) -> Particles:
-        """These particles followed by those of ``other``, which get new labels where they have none."""
+        """These particles followed by those of ``other``; where they lack them these get labels and full confidence."""
         theirs = other._arrays()
         if self.label is not None and other.label is None:
             first = int(self.label.max()) + 1 if self.count else 0
             theirs["label"] = torch.arange(first, first + other.count, device=self.label.device)
+        if other.confidence is None:
+            theirs["confidence"] = torch.ones_like(other.mass)
         return replace(self, **{name: torch.cat([value, theirs[name]]) for name, value in self._arrays().items()})
 
     def repeated(self, members: int) -> Particles:

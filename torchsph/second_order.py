@@ -36,7 +36,8 @@ def verlet_step(
     velocity = _kicked(start, start.velocity, dt, acceleration)
     mean = middle.changed(velocity=0.5 * (start.velocity + velocity))
     late = stepper.evaluate_rates(mean, pairs, wall)
-    moved = middle.position + 0.5 * dt[:, None] * velocity + stepper.wandering(mean, late.sums, late.crowding, step)
+    drift = 0.5 * dt[:, None] * velocity + stepper.wandering(mean, late.sums, late.crowding, step, mean)
+    moved = middle.position + drift
     after = start.changed(position=moved, velocity=velocity, deviation=start.deviation + dt * late.rate)
     return stepper.retarded(after, wall, dt), acceleration, begin
 
@@ -63,7 +64,7 @@ def predictor_corrector_step(
     acceleration = stepper.acceleration(middle, pairs, second.divergence, wall, around)
     velocity = _kicked(start, start.velocity, dt, acceleration)
     drift = half[:, None] * (start.velocity + velocity)
-    drift = drift + stepper.wandering(middle, second.sums, second.crowding, step)
+    drift = drift + stepper.wandering(middle, second.sums, second.crowding, step, middle)
     after = start.changed(
         position=start.position + drift, velocity=velocity, deviation=start.deviation + dt * second.rate
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -290,14 +290,26 @@ class Simulation:
         if self._acceleration.shape != self.particles.position.shape:
             self._acceleration = torch.zeros_like(self.particles.position)
 
-    def impose(self, grid: Grid, velocity: Tensor, mask: Tensor) -> None:
+    def impose(self, grid: Grid, velocity: Tensor, mask: Tensor, confidence: Tensor | None = None) -> None:
         """Replace the particles' velocities by those of a grid at the present time.
 
         Args:
             grid: the nodes, m. velocity: (D, *shape) for all members or (members, D, *shape), m/s.
             mask: (*shape) bool, where the velocity is known. Beyond it the walls' velocity continues the field.
+            confidence: (*shape), not negative, how far each node is to be trusted; the particles carry it along, and it
+                weighs them in XSPH and in fetching (thesis 5.2). None: all alike.
+
+        Raises:
+            ValueError: a confidence is negative or not finite.
         """
+        if confidence is not None and not bool((torch.isfinite(confidence) & (confidence >= 0)).all()):
+            raise ValueError("confidences must be finite and not negative")
         self.particles = self.domain.imposed(self.particles, grid, velocity, mask, self.time)
+        carried = None
+        if confidence is not None:
+            field = confidence.to(self.particles.velocity)[None]
+            carried = grid.sample(field, self.particles.position * self.units.length)[0].clamp_min(0.0)
+        self.particles = replace(self.particles, confidence=carried)
         self._imposed_at = self.time
         self._forget_pairs()
 
@@ -323,7 +335,8 @@ class Simulation:
         points = points.to(p.position.dtype).repeat(self.members, 1)
         owner = torch.arange(self.members, device=p.member.device).repeat_interleave(len(node))
         found = fetch_at(
-            self._backend, points, owner, p.position, p.member, carried, FETCH_RADIUS, period=self.domain.period
+            self._backend, points, owner, p.position, p.member, carried, FETCH_RADIUS, period=self.domain.period,
+            weight=p.confidence,
         )
         dimension = grid.dimension
         value = p.velocity.new_zeros((self.members, dimension, grid.size))

@@ -77,7 +77,7 @@ def _solve_small(matrix: Tensor, right: Tensor) -> Tensor:
 
 def fetch_at(
     backend: Backend, points: Tensor, point_member: Tensor, position: Tensor, member: Tensor, value: Tensor,
-    radius: float, *, period: Tensor | None = None, widen: int = 2,
+    radius: float, *, period: Tensor | None = None, widen: int = 2, weight: Tensor | None = None,
 ) -> Fetched:
     """Particle values at points by first-order MLS.
 
@@ -86,6 +86,7 @@ def fetch_at(
         position: (N, D), member: (N,), value: (N, C) of the particles; same units as ``points``.
         radius: support of the weight. A point with fewer than D + 1 particles inside it is tried again with 1.5x the
             radius, ``widen`` times.
+        weight: (N,), not negative, of the particles; None: all alike.
 
     Returns:
         ``Fetched`` with value (M, C) and covered (M,); uncovered points hold 0.
@@ -99,7 +100,8 @@ def fetch_at(
             break
         support = Support(kernel("wendland_c2"), 0.5 * radius, dimension)
         m = backend.interpolate(
-            position, member, value, support, points[open_points], point_member[open_points], period=period
+            position, member, value, support, points[open_points], point_member[open_points], period=period,
+            weight=weight,
         )
         some = first_order_value(m.value, m.first, m.second, m.field, m.field_first)
         enough = m.count > dimension

@@ -53,6 +53,7 @@ typedef struct { /* moments of a first-order moving-least-squares fetch; see int
   double support, sigma;
   const double* lengths;      /* (members,) */
   void *count, *value, *first, *second, *field, *field_first;
+  const void* weights;        /* (particles,) that the kernel is multiplied by, or null */
 } sph_interpolation;
 
 typedef struct { /* closest surface points of the nodes of a regular grid, x fastest; see closest.cpp */

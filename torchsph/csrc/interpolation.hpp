@@ -12,6 +12,12 @@ struct InterpolationKernel {
   const double* lengths;  // (members,)
 };
 
+template <class Real> struct Carried {
+  const Real* fields;     // (particles, columns)
+  std::int64_t columns;
+  const Real* weights;    // (particles,), or null: all one
+};
+
 template <class Real> struct Moments {
   Real *count, *value, *first, *second, *field, *field_first;  // (queries,) twice, (.., D), (.., D, D), (.., C), (.., D, C)
 };
@@ -20,7 +26,7 @@ template <class Real> struct Moments {
 template <class Real, int D, bool Plain> struct Interpolation {
   using L = Lanes<Real>;
   using V = typename L::Vector;
-  static constexpr int fields = D + 1 + D;  // position, presence, columns of the field
+  static constexpr int fields = D + 1 + D;  // position, weight (0: absent), columns of the field
 
   struct Sums {
     V count{}, value{}, first[D] = {}, second[D * D] = {}, field[D] = {}, field_first[D * D] = {};
@@ -70,7 +76,7 @@ template <class Real, int D, bool Plain> struct Interpolation {
   }
 
   // Rows of the particles with `D` columns of the fields from `column` on; the null slot is absent and far away.
-  static void pack(const Columns<Real>& c, const Real* values, std::int64_t column, std::int64_t columns, int threads, std::vector<Real>& rows) {
+  static void pack(const Columns<Real>& c, const Carried<Real>& carried, std::int64_t column, int threads, std::vector<Real>& rows) {
     constexpr int stride = (fields + 7) / 8 * 8;
     rows.resize((c.slots() + 2) * stride);
 #pragma omp parallel for num_threads(threads) schedule(static)
@@ -79,16 +85,18 @@ template <class Real, int D, bool Plain> struct Interpolation {
       const bool present = s < c.slots() && c.slot[s] >= 0;
       for (int f = 0; f < stride; ++f) row[f] = 0;
       for (int d = 0; d < D; ++d) row[d] = present ? c.at[d][s] : Real(1e15);
-      row[D] = present ? Real(1) : Real(0);
-      if (!Plain && present)
-        for (int k = 0; k < D && column + k < columns; ++k) row[D + 1 + k] = values[std::int64_t(c.slot[s]) * columns + column + k];
+      if (!present) continue;
+      row[D] = carried.weights ? carried.weights[c.slot[s]] : Real(1);
+      if (Plain) continue;
+      const Real* values = carried.fields + std::int64_t(c.slot[s]) * carried.columns + column;
+      for (int k = 0; k < D && column + k < carried.columns; ++k) row[D + 1 + k] = values[k];
     }
   }
 
   static void sweep(const Columns<Real>& c, const Columns<Real>& queries, const Shape& shape, const InterpolationKernel& kernel,
-                    const Real* values, std::int64_t column, std::int64_t columns, const Moments<Real>& out) {
+                    const Carried<Real>& carried, std::int64_t column, const Moments<Real>& out) {
     std::vector<Real> rows;
-    pack(c, values, column, columns, shape.threads, rows);
+    pack(c, carried, column, shape.threads, rows);
 #pragma omp parallel num_threads(shape.threads)
     {
       std::vector<std::int32_t> list(4096);
@@ -110,7 +118,7 @@ template <class Real, int D, bool Plain> struct Interpolation {
             for (std::int32_t n = 0; n < run[1]; n += L::partners)
               add(query, L::all(Real(1 / h)), kernel.kernel, Partner<Real, fields>(rows.data(), run + 2 + n, (fields + 7) / 8 * 8), sums);
           }
-          write(sums, queries.slot.data() + g * cluster_size + group * L::own, scale, column, columns, out);
+          write(sums, queries.slot.data() + g * cluster_size + group * L::own, scale, column, carried.columns, out);
         }
       }
     }

@@ -98,10 +98,10 @@ template <int D> std::int64_t interpolate(const sph_interpolation& p) {
   const InterpolationKernel kernel{{p.kernel, p.support, p.sigma}, p.lengths};
   const auto out = [](void* a) { return static_cast<Real*>(a); };
   const Moments<Real> moments{out(p.count), out(p.value), out(p.first), out(p.second), out(p.field), out(p.field_first)};
-  const Real* fields = static_cast<const Real*>(p.fields);
-  Interpolation<Real, D, true>::sweep(columns, queries, shape, kernel, fields, 0, p.columns, moments);
+  const Carried<Real> carried{static_cast<const Real*>(p.fields), p.columns, static_cast<const Real*>(p.weights)};
+  Interpolation<Real, D, true>::sweep(columns, queries, shape, kernel, carried, 0, moments);
   for (std::int64_t c = 0; c < p.columns; c += D)
-    Interpolation<Real, D, false>::sweep(columns, queries, shape, kernel, fields, c, p.columns, moments);
+    Interpolation<Real, D, false>::sweep(columns, queries, shape, kernel, carried, c, moments);
   return 0;
 }
 

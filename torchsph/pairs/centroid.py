@@ -35,7 +35,8 @@ def centroid_xsph(state: PairState, support: Support, cell: float, period: Tenso
         return values.new_zeros((keys.shape[0], *values.shape[1:])).index_add(0, own, values)
 
     mass, volume = total(state.mass), total(state.volume)
-    velocity = total(state.mass[:, None] * state.velocity) / mass[:, None]
+    # a cell of weightless particles pulls nobody
+    velocity = total(state.mass[:, None] * state.velocity) / mass.clamp_min(torch.finfo(mass.dtype).tiny)[:, None]
     length = per_particle(support.length, state.member)
     pull = torch.zeros_like(state.velocity)
     for offset in itertools.product((-1, 0, 1), repeat=dimension):

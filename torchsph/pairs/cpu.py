@@ -138,8 +138,9 @@ class CpuBackend(PlannedBackend):
         query_member: Tensor,
         *,
         period: Tensor | None = None,
+        weight: Tensor | None = None,
     ) -> Moments:
-        self.check(position, fields, query)
+        self.check(position, fields, query, *(() if weight is None else (weight,)))
         check_search(None, support.radius, period)
         members = 1 + max((int(m.max()) for m in (member, query_member) if m.numel()), default=0)
         kind, numbers = plan.kernel_choice(support, self.name)
@@ -147,6 +148,7 @@ class CpuBackend(PlannedBackend):
         tensors = (t.detach().contiguous() for t in (position, member, fields, query, query_member))
         return Moments(
             *operators.interpolation_moments(
-                *tensors, support.radius, lengths(period, position.shape[1]), kind, numbers, smoothing
+                *tensors, support.radius, lengths(period, position.shape[1]), kind, numbers, smoothing,
+                None if weight is None else weight.contiguous(),
             )
         )

@@ -196,6 +196,7 @@ def _interpolation_moments_shapes(
     kind: int,
     kernel: Sequence[float],
     lengths: Tensor,
+    weight: Tensor | None = None,
 ) -> list[Tensor]:
     return _allocate_moments(fields, query)
 
@@ -212,8 +213,9 @@ def interpolation_moments(
     kind: int,
     kernel: Sequence[float],
     lengths: Tensor,
+    weight: Tensor | None = None,
 ) -> list[Tensor]:
-    """Moments of particles around queries; shapes as in ``Moments``, ``lengths`` (members,) float64.
+    """Moments of particles around queries; shapes as in ``Moments``, ``lengths`` (members,) float64, ``weight`` (N,).
 
     Raises:
         ValueError: a position is not finite, or a member index is negative.
@@ -232,6 +234,7 @@ def interpolation_moments(
         kernel[1],
         lengths.data_ptr(),
         *(output.data_ptr() for output in outputs),
+        _address(weight),
     )
     unusable = library().function("interpolate", _REALS[position.dtype])(ctypes.byref(arguments))
     if unusable:

@@ -115,10 +115,11 @@ class CudaBackend(PlannedBackend):
         query_member: Tensor,
         *,
         period: Tensor | None = None,
+        weight: Tensor | None = None,
     ) -> Moments:
         # once per recorded frame: the reference's torch on this device is fast enough
         return ReferenceBackend().interpolate(
-            position, member, fields, support, query, query_member, period=period
+            position, member, fields, support, query, query_member, period=period, weight=weight
         )
 
     def _evaluate(

@@ -247,12 +247,14 @@ class Backend(ABC):
         query_member: Tensor,
         *,
         period: Tensor | None = None,
+        weight: Tensor | None = None,
     ) -> Moments:
         """Moments of a first-order moving-least-squares fit at query points.
 
         Args:
             position: (N, D), member: (N,) int64, fields: (N, C) of the particles.
             query: (M, D), query_member: (M,) int64; a query sees the particles of its own member only.
+            weight: (N,) of the particles, not negative, that W is multiplied by; None: all one.
         """
 
 

@@ -108,6 +108,7 @@ class InterpolationArguments(ctypes.Structure):
         ("second", _pointer),
         ("field", _pointer),
         ("field_first", _pointer),
+        ("weights", _pointer),
     ]
 
 

@@ -138,6 +138,7 @@ class ReferenceBackend(Backend):
         query_member: Tensor,
         *,
         period: Tensor | None = None,
+        weight: Tensor | None = None,
     ) -> Moments:
         check_search(torch.cat((position, query)), support.radius, period)
         row, particle = cross_pairs(query, query_member, position, member, support.radius, period)
@@ -146,19 +147,20 @@ class ReferenceBackend(Backend):
             length = support.length.index_select(0, particle)
         else:
             length = per_particle(support.length, query_member.index_select(0, row))
-        weight = support.kernel.value(offset.norm(dim=1), length, support.dimension)
-        first = weight[:, None] * offset
+        share = support.kernel.value(offset.norm(dim=1), length, support.dimension)
+        share = share if weight is None else share * weight.index_select(0, particle)
+        first = share[:, None] * offset
         carried = fields.index_select(0, particle)
 
         def collect(part: Tensor) -> Tensor:
             return part.new_zeros((query.shape[0], *part.shape[1:])).index_add(0, row, part)
 
         return Moments(
-            collect((weight > 0).to(weight.dtype)),
-            collect(weight),
+            collect((share > 0).to(share.dtype)),
+            collect(share),
             collect(first),
             collect(first[:, :, None] * offset[:, None, :]),
-            collect(weight[:, None] * carried),
+            collect(share[:, None] * carried),
             collect(first[:, :, None] * carried[:, None, :]),
         )
 
