@@ -256,7 +256,8 @@ class Domain:
             points = self.reservoirs.mouth_points(particles)
         else:
             points = particles.position
-        return particles.changed(velocity=self.sampled(particles, grid, field, points))
+        particles = particles.changed(velocity=self.sampled(particles, grid, field, points))
+        return particles if self.reservoirs is None else self.reservoirs.driven(particles, channel=True)
 
     def sampled(
         self, particles: Particles, grid: Grid, field: Tensor, position: Tensor | None = None

@@ -11,6 +11,7 @@ from .pairs.interface import PairState
 
 FLUID = 0
 RESERVOIR = 1
+CHANNEL = -1
 
 
 @dataclass(frozen=True)
@@ -21,10 +22,12 @@ class Particles:
         position: (N, D). velocity: (N, D).
         deviation: (N,), (rho - rho0) / rho0. mass: (N,), m / rho0 (a volume at rest density).
         member: (N,) int64, 0 <= member < members.
-        kind: (N,) int64, FLUID, or RESERVOIR + v for a particle of the buffer of valve v.
+        kind: (N,) int64, FLUID; RESERVOIR + v for a particle of the buffer of opening v, whose velocity is prescribed;
+            CHANNEL - v for one that has left through opening v and still moves freely.
         members: B.
         label: (N,) int64, a numbering that survives sorting, or None.
         confidence: (N,), not negative, what a particle's velocity counts for in XSPH and in fetching; None: all alike.
+        pressure: (N,), time step times pressure over density of the last projection, or None (schemes without one).
     """
 
     position: Tensor
@@ -36,6 +39,7 @@ class Particles:
     members: int
     label: Tensor | None = None
     confidence: Tensor | None = None
+    pressure: Tensor | None = None
 
     @property
     def count(self) -> int:
@@ -49,7 +53,12 @@ class Particles:
 
     @property
     def fluid(self) -> Tensor:
-        """(N,) bool: particles of the fluid, not of a reservoir."""
+        """(N,) bool: particles that move freely, those in the channel behind an outlet included."""
+        return self.kind <= FLUID
+
+    @property
+    def inside(self) -> Tensor:
+        """(N,) bool: particles of the fluid within the walls."""
         return self.kind == FLUID
 
     def changed(self, **values: Tensor) -> Particles:
@@ -68,6 +77,8 @@ class Particles:
             theirs["label"] = torch.arange(first, first + other.count, device=self.label.device)
         if other.confidence is None:
             theirs["confidence"] = torch.ones_like(other.mass)
+        if other.pressure is None:
+            theirs["pressure"] = torch.zeros_like(other.mass)
         return replace(self, **{name: torch.cat([value, theirs[name]]) for name, value in self._arrays().items()})
 
     def repeated(self, members: int) -> Particles:

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from geometry import OrificePlane, orifices
 
-from .particles import FLUID, RESERVOIR, Particles
+from .particles import CHANNEL, FLUID, RESERVOIR, Particles
 from .record import Record
 
 if TYPE_CHECKING:
@@ -45,6 +45,8 @@ class Reservoirs:
         self.valves = domain.scene.valves
         self.flat = domain.scheme.valve.profile == "flat"
         self.length = float(np.ceil(domain.support_radius) + 1.0)
+        # free channel between an outlet and its buffer: nothing inside then sees a prescribed particle
+        self.run_out = float(np.ceil(domain.support_radius))
         self.times, self.flux = self._flux_table()
         labels = {valve.region: number for number, valve in enumerate(self.valves)}
         # a region may consist of several openings; each has a buffer of its own
@@ -94,12 +96,21 @@ class Reservoirs:
         total = sum(frame.area for n, frame in self._active() if self.openings[n].label == mine)
         return part * (self.frame(number).area / total)
 
+    def _lead(self, number: int) -> float:
+        """Length of the free channel before the buffer of an opening: 0 where fluid enters in the present interval.
+
+        A particle that leaves must not feel at once what is prescribed for it: at a Neumann boundary of the pressure
+        no pressure could bring it to the prescribed speed.
+        """
+        middle = torch.tensor([self.domain.middle], dtype=torch.float64, device=self.domain.device)
+        return self.run_out if float(self._flux_through(number, self.inflow(middle))) < 0.0 else 0.0
+
     def opened(self, particles: Particles) -> Particles:
         """Make the buffers of valves that are open and have none, drop those of valves that have shut."""
         chosen = self.domain.open_regions
-        shut = [RESERVOIR + n for n, one in enumerate(self.openings) if one.label not in chosen]
-        if shut:
-            kind = torch.tensor(shut, device=particles.kind.device)
+        gone = [n for n, one in enumerate(self.openings) if one.label not in chosen]
+        if gone:
+            kind = torch.tensor([k for n in gone for k in (RESERVOIR + n, CHANNEL - n)], device=particles.kind.device)
             stay = ~torch.isin(particles.kind, kind)
             particles = particles if bool(stay.all()) else particles.select(stay)
         for number, frame in self._active():
@@ -110,15 +121,17 @@ class Reservoirs:
         return particles
 
     def _buffer(self, particles: Particles, number: int, frame: _Frame, members: Tensor) -> Particles:
-        """A fresh lattice in the channel of one valve for some members."""
-        place = frame.lattice(self.length)
+        """A fresh lattice in the channel of one valve for some members, its first part free where fluid leaves."""
+        lead = self._lead(number)
+        place = frame.lattice(lead + self.length)
+        kind = torch.where(frame.height(place) < lead, CHANNEL - number, RESERVOIR + number)
         count, copies = place.shape[0], members.numel()
         mass = torch.stack([particles.mass[particles.member == m].mean() for m in members.tolist()])
         new = Particles(
             position=place.repeat(copies, 1), velocity=place.new_zeros((count * copies, place.shape[1])),
             deviation=self._mouth_deviation(particles, frame, members).repeat_interleave(count),
             mass=mass.repeat_interleave(count), member=members.repeat_interleave(count),
-            kind=torch.full((count * copies,), RESERVOIR + number, dtype=torch.int64, device=place.device),
+            kind=kind.repeat(copies),
             members=particles.members,
         )
         return new
@@ -131,40 +144,44 @@ class Reservoirs:
         total = particles.per_member(weight * particles.deviation, "sum")
         return (total / particles.per_member(weight, "sum").clamp_min(1.0))[members]
 
-    def driven(self, particles: Particles) -> Particles:
-        """Give the buffers' particles their velocity for the present time."""
+    def driven(self, particles: Particles, *, channel: bool = False) -> Particles:
+        """Give the buffers' particles their velocity for the present time; with ``channel`` also the free channels'."""
         times = self.domain.member_times(particles.members)
         inflow = self.inflow(times)
         velocity = particles.velocity
         for number, frame in self._active():
-            row = torch.nonzero(particles.kind == RESERVOIR + number).squeeze(1)
+            mine, length = particles.kind == RESERVOIR + number, self.length
+            if channel:
+                mine, length = mine | (particles.kind == CHANNEL - number), length + self._lead(number)
+            row = torch.nonzero(mine).squeeze(1)
             owner, old = particles.member[row], velocity[row]
             along = (old * frame.normal).sum(1)
             own = self._orifice_velocity(frame)
             speed = -self._flux_through(number, inflow) / frame.area  # outward
-            target = self._profile(along - (own * frame.normal).sum(), owner, speed, frame, particles)
+            share = frame.area * length / self._volume(particles, row)
+            target = self._profile(along - (own * frame.normal).sum(), owner, speed * share.clamp(*_AREA_TRUST))
             new = own + target[:, None] * frame.normal
             velocity = velocity.index_copy(0, row, new)
         return particles.changed(velocity=velocity)
 
-    def _profile(
-        self, along: Tensor, owner: Tensor, speed: Tensor, frame: _Frame, particles: Particles
-    ) -> Tensor:
-        """Scale the buffer's present normal velocities so that their flux is ``speed`` times the orifice's area."""
-        members = speed.shape[0]
+    @staticmethod
+    def _volume(particles: Particles, row: Tensor) -> Tensor:
+        """Volume of the particles in ``row`` of each member, (members,)."""
+        mass = particles.mass[row]
+        total = mass.new_zeros(particles.members).index_add(0, particles.member[row], mass)
+        return total.clamp_min(float(particles.mass.mean()) if particles.count else 1.0)
+
+    def _profile(self, along: Tensor, owner: Tensor, speed: Tensor) -> Tensor:
+        """Scale present normal velocities (n,) so that each member's mean is ``speed`` (members,); flat without any."""
         ones = torch.ones_like(along)
         shape = ones if self.flat else along.abs()
 
         def total(values: Tensor) -> Tensor:
-            return values.new_zeros(members).index_add(0, owner, values)
+            return torch.zeros_like(speed).index_add(0, owner, values)
 
-        count, sum_shape = total(ones).clamp_min(1.0), total(shape)
-        mean = sum_shape / count
+        mean = total(shape) / total(ones).clamp_min(1.0)
         flat = mean < 1e-5
-        mass = particles.mass.mean()
-        occupied = count * mass / self.length
-        wanted = speed * (frame.area / occupied).clamp(*_AREA_TRUST)
-        scale = torch.where(flat, wanted, wanted / mean.clamp_min(1e-5))
+        scale = torch.where(flat, speed, speed / mean.clamp_min(1e-5))
         return torch.where(flat[owner], ones, shape) * scale[owner]
 
     def _orifice_velocity(self, frame: _Frame) -> Tensor:
@@ -175,37 +192,38 @@ class Reservoirs:
 
     def exchange(self, particles: Particles, record: Record) -> tuple[Particles, bool]:
         """Turn particles that have crossed an open orifice into the other kind; feed and clear the far ends."""
-        kind = particles.kind
-        gone = torch.zeros_like(particles.fluid)
-        fresh: list[Particles] = []
+        kind, gone, fresh = particles.kind, torch.zeros_like(particles.fluid), []
         for number, frame in self._active():
-            height = frame.height(particles.position)
-            label = RESERVOIR + number
-            entered = (kind == label) & (height < 0.0)
-            out = particles.fluid & (height > _HYSTERESIS) & (height < self.length)
-            candidates = torch.nonzero(out).squeeze(1)
-            if candidates.numel():
-                over = frame.inset(particles.position[candidates]) > 0
-                out = torch.zeros_like(out).index_put((candidates[over],), torch.ones_like(over[over]))
-            far = (kind == label) & (height > self.length)
-            if bool(entered.any()):
-                copy = particles.select(entered)
+            height, lead = frame.height(particles.position), self._lead(number)
+            buffer, channel = RESERVOIR + number, CHANNEL - number
+            entered = ((kind == buffer) | (kind == channel)) & (height < 0.0)
+            fed = entered & (kind == buffer)
+            if bool(fed.any()):
+                copy = particles.select(fed)
                 fresh.append(copy.changed(position=copy.position + self.length * frame.normal))
+            out = self._left(kind, height, frame, particles)
+            beyond = ((kind == buffer) | (kind == channel) | out) & ~entered
+            kind = torch.where(beyond, torch.where(height < lead, channel, buffer), kind)
             kind = torch.where(entered, torch.full_like(kind, FLUID), kind)
-            kind = torch.where(out, torch.full_like(kind, label), kind)
-            gone |= far
+            gone |= beyond & (height > lead + self.length)
             for counter, which in ((record.inserted, entered), (record.removed, out)):
                 counter[:, self.valve_of[number]] += particles.per_member(which.to(torch.int64), "sum")
-        changed = bool(fresh) or bool(gone.any())
-        if not changed and kind is particles.kind:
-            return particles, False
         particles = particles.changed(kind=kind)
-        if not changed:
+        if not fresh and not bool(gone.any()):
             return particles, False
         particles = particles.select(~gone)
         for copy in fresh:
             particles = particles.joined(copy)
         return particles, True
+
+    def _left(self, kind: Tensor, height: Tensor, frame: _Frame, particles: Particles) -> Tensor:
+        """(N,) bool: particles of the fluid that have just left through an opening."""
+        out = (kind == FLUID) & (height > _HYSTERESIS) & (height < self.run_out + self.length)
+        candidates = torch.nonzero(out).squeeze(1)
+        if candidates.numel():
+            over = frame.inset(particles.position[candidates]) > 0
+            out = torch.zeros_like(out).index_put((candidates[over],), torch.ones_like(over[over]))
+        return out
 
     def mouth_points(self, particles: Particles) -> Tensor:
         """Where to look up an imposed field (N, D): fluid particles at their place, buffers just inside the orifice.
@@ -216,7 +234,8 @@ class Reservoirs:
         for number, frame in self._active():
             height = frame.height(points)
             inward = (-height - _MOUTH)[:, None] * frame.normal
-            points = torch.where((particles.kind == RESERVOIR + number)[:, None], points + inward, points)
+            mine = (particles.kind == RESERVOIR + number) | (particles.kind == CHANNEL - number)
+            points = torch.where(mine[:, None], points + inward, points)
         return points
 
 
