@@ -47,9 +47,11 @@ class Stepper:
     """Steps particles with one scheme; holds no state but the neighbour list and the coefficients in use."""
 
     def __init__(
-        self, scheme: WeaklyCompressible, coefficients: Coefficients, search: PairSearch, dimension: int
+        self, scheme: WeaklyCompressible, coefficients: Coefficients, search: PairSearch, dimension: int,
+        *, buffered: bool = True,
     ) -> None:
-        self.scheme, self.pair_search, self.dimension = scheme, search, dimension
+        """``buffered``: whether there can be particles of reservoirs, which are not the stepper's to move."""
+        self.scheme, self.pair_search, self.dimension, self._buffered = scheme, search, dimension, buffered
         self.use(coefficients)
 
     def use(self, coefficients: Coefficients) -> None:
@@ -101,8 +103,7 @@ class Stepper:
         compression, crowding = self._complete(particles, rates, wall)
         particles = self._new_density(particles, rates, compression, dt, filtering)
         acceleration = self.acceleration(particles, pairs, compression, wall, around)
-        fluid = particles.fluid[:, None]
-        velocity = torch.where(fluid, particles.velocity + dt[:, None] * acceleration, particles.velocity)
+        velocity = self.kicked(particles, particles.velocity, dt, acceleration)
         particles = self.retarded(particles.changed(velocity=velocity), wall, dt)
         drift = dt[:, None] * particles.velocity + self.wandering(particles, rates, crowding, step, seen)
         return particles.changed(position=particles.position + drift), acceleration, wall
@@ -123,7 +124,18 @@ class Stepper:
                 particles, crowding, step, self.coefficients.smoothing_length, self.coefficients.shifting,
                 self.scheme.shifting_speed == "largest",
             )
-        return torch.where(particles.fluid[:, None], drift, torch.zeros_like(drift))
+        return self._of_fluid(particles, drift)
+
+    def kicked(self, particles: Particles, velocity: Tensor, dt: Tensor, acceleration: Tensor) -> Tensor:
+        """Velocities (N, D) after a kick; the buffers of reservoirs keep theirs."""
+        return velocity + self._of_fluid(particles, dt[:, None] * acceleration)
+
+    def _of_fluid(self, particles: Particles, values: Tensor) -> Tensor:
+        """Values (N, ...) of the fluid's particles and 0 for those of reservoirs."""
+        if not self._buffered:
+            return values
+        fluid = particles.fluid.reshape(-1, *[1] * (values.ndim - 1))
+        return torch.where(fluid, values, torch.zeros_like(values))
 
     def _pull(self, particles: Particles, plain: Tensor | None) -> Tensor:
         """XSPH's sum (N, D), ``plain`` where it is the full one without confidences.
@@ -243,7 +255,7 @@ class Stepper:
             pressure = pressure + per_particle(c.background, member) * sound**2
         if c.bulk_damping is not None and divergence is not None:
             damping = per_particle(c.bulk_damping * c.sound_speed * c.smoothing_length, member) * divergence
-            pressure = pressure - torch.where(particles.fluid, damping, torch.zeros_like(damping))
+            pressure = pressure - self._of_fluid(particles, damping)
         return pressure
 
     def acceleration(

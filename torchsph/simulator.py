@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -103,7 +104,8 @@ class Simulation:
         self._coefficients = Coefficients.of(self.parameters, self.units, scene.fluid.density)
         self._backend = choose_backend(simulator.backend, simulator.device)
         search = PairSearch(self._backend, self.domain.support_radius, _SEARCH_MARGIN, self.domain.period)
-        self._stepper = Stepper(scheme, self._coefficients, search, scene.dimension)
+        buffered = self.domain.reservoirs is not None
+        self._stepper = Stepper(scheme, self._coefficients, search, scene.dimension, buffered=buffered)
         self._control = StepControl(self.record, scheme.step_floor)
         self._acceleration = torch.zeros_like(particles.position)
         self._imposed_at = self.time
@@ -246,8 +248,9 @@ class Simulation:
         """Members (members,) bool with a particle that is not finite, or denser or thinner than a rollback allows."""
         p, options = self.particles, self.simulator.scheme.rollback
         broken = torch.zeros_like(self.record.failed)
-        finite = torch.isfinite(p.position).all(1) & torch.isfinite(p.velocity).all(1) & torch.isfinite(p.deviation)
-        if not bool(finite.all()):
+        # a sum is finite only if all its terms are; which they are is looked up only where it is not
+        if not math.isfinite(float(p.position.sum() + p.velocity.sum() + p.deviation.sum())):
+            finite = torch.isfinite(p.position).all(1) & torch.isfinite(p.velocity).all(1) & torch.isfinite(p.deviation)
             broken = p.per_member((~finite).to(torch.int64), "sum") > 0
         if options is not None:
             broken |= (1.0 + lowest < options.density[0]) | (1.0 + highest > options.density[1])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from .pairs.interface import per_particle
+from .pairs.interface import per_particle, square_length
 from .pairs.reference import SINGULARITY
 from .particles import Particles
 from .smoothing import SmoothingKernel
@@ -62,13 +62,13 @@ def shifting_displacement(
     shift below anything that the velocity would have to be corrected for. With ``largest`` the speed is the largest
     of the member (Sun et al. 2017 eq. 14), so that stagnation points are evened out as well.
     """
-    speed = particles.velocity.norm(dim=1).clamp_min(_SPEED_FLOOR)
+    speed = square_length(particles.velocity).sqrt().clamp_min(_SPEED_FLOOR)
     if largest:
         speed = particles.per_member(speed, "amax").index_select(0, particles.member)
     amount = per_particle(strength * smoothing_length, particles.member) * speed * per_particle(step, particles.member)
     shift = -amount[:, None] * concentration
-    length = shift.norm(dim=1, keepdim=True)
-    return shift * (_SHIFT_CAP / length.clamp_min(_SHIFT_CAP))
+    length = square_length(shift).sqrt()
+    return shift * (_SHIFT_CAP / length.clamp_min(_SHIFT_CAP))[:, None]
 
 
 _QUADRATURE = 4001
