@@ -5,10 +5,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from .pairs.interface import per_particle, square_length
+from .pairs.interface import Rates, per_particle, square_length
 from .pairs.reference import SINGULARITY
 from .particles import Particles
 from .smoothing import SmoothingKernel
+from .transfer import solve_small
 
 # names of the time-step limits, in the order of ``step_limits``
 LIMITS = ("acoustic", "viscous", "force", "frame", "end of interval")
@@ -39,6 +40,21 @@ def step_limits(
     viscous = courant * h * h / (8.0 * nu).clamp_min(torch.finfo(speed.dtype).tiny)
     force = courant * torch.sqrt(0.5 * h / acceleration.clamp_min(torch.finfo(speed.dtype).tiny))
     return torch.stack([acoustic.expand_as(speed), viscous, force])
+
+
+def shepard_deviation(sums: Rates) -> Tensor:
+    """Density deviation (N,) after Shepard's filter (2.20)."""
+    return sums.shepard_mass / sums.shepard_volume - 1.0
+
+
+def mls_deviation(sums: Rates) -> Tensor:
+    """Density deviation (N,) of moving least squares (Colagrossi & Landrini 2003 eqs. 12-14; Dilts 1999).
+
+    Exact for a linear density; where the neighbours lie in a line or plane, Shepard's value.
+    """
+    tilt = -solve_small(sums.moment_second, sums.moment_first[:, :, None])[:, :, 0]
+    volume = sums.shepard_volume + (tilt * sums.moment_first).sum(1)
+    return (sums.shepard_mass + (tilt * sums.moment_mass).sum(1)) / volume - 1.0
 
 
 def softened_share(kernel: SmoothingKernel, dimension: int) -> float:
