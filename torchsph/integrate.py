@@ -124,7 +124,7 @@ class Stepper:
         if crowding is not None:
             drift = drift + shifting_displacement(
                 particles, crowding, step, self.coefficients.smoothing_length, self.coefficients.shifting,
-                self.scheme.shifting_speed == "largest",
+                self.scheme.shifting_speed == "largest", self.scheme.shifting_surface,
             )
         return self._of_fluid(particles, drift)
 

@@ -169,6 +169,8 @@ class WeaklyCompressible:
         wall: wall model for scenes with walls; valve: valve model for scenes with valves (None: stays shut).
         shifting_speed: the speed in the shifting: "local" (the particle's own) or "largest" (of its member: also
             stagnation points are evened out, which a vortex needs and a jet in a resting chamber does not).
+        shifting_surface: h times the crowding gradient above which a particle counts as one of a free surface and is
+            not shifted (Lind et al. 2012 section 3.4 in its simplest form), or None: all are.
         tensile: R of Monaghan's tensile correction (2000; 0.2 there, symmetric pressure form only), or None.
         order: "thesis" steps as algorithm 1; "symplectic" evaluates both passes at one position (symplectic Euler);
             "verlet" is the position Verlet scheme, "predictor_corrector" the symplectic predictor-corrector, both of
@@ -195,6 +197,7 @@ class WeaklyCompressible:
     xsph: XSPH | None = None
     shifting: float | None = 0.5
     shifting_speed: str = "local"
+    shifting_surface: float | None = None
     tensile: float | None = None
     bulk_damping: float | None = 0.3
     shepard_period: int | None = None
@@ -242,6 +245,11 @@ class WeaklyCompressible:
         if self.xsph is not None and self.xsph.level == "velocity" and self.order != "thesis":
             raise ValueError(
                 f"XSPH of level 'velocity' belongs to order 'thesis', got order '{self.order}'; use level 'position'"
+            )
+        if self.shifting_surface is not None and not (self.shifting_surface > 0 and self.shifting is not None):
+            raise ValueError(
+                "WeaklyCompressible.shifting_surface must be positive and needs shifting, got "
+                f"{self.shifting_surface} with shifting {self.shifting}"
             )
         if self.shepard_period is not None and self.order not in ("thesis", "symplectic"):
             raise ValueError(f"the Shepard filter needs order 'thesis' or 'symplectic', got '{self.order}'")

@@ -77,6 +77,8 @@ class Simulation:
         """
         if until < self.time:
             raise ValueError(f"cannot advance backwards, from {self.time} s to {until} s")
+        if until == self.time:
+            return
         self._fail_lost()
         if self.particles.count >= _SORT_FROM:
             self.particles = self.particles.labelled()

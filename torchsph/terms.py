@@ -70,19 +70,24 @@ def softened_share(kernel: SmoothingKernel, dimension: int) -> float:
 
 def shifting_displacement(
     particles: Particles, concentration: Tensor, step: Tensor, smoothing_length: float | Tensor,
-    strength: float | Tensor, largest: bool = False,
+    strength: float | Tensor, largest: bool = False, surface: float | None = None,
 ) -> Tensor:
     """Displacement -A h |v| dt grad C that evens out the particles (Lind et al. 2012, speed-limited form), (N, D).
 
     A floor on the speed keeps a resting fluid from freezing in disorder; a cap of a tenth of a spacing keeps the
     shift below anything that the velocity would have to be corrected for. With ``largest`` the speed is the largest
-    of the member (Sun et al. 2017 eq. 14), so that stagnation points are evened out as well.
+    of the member (Sun et al. 2017 eq. 14), so that stagnation points are evened out as well. Particles with
+    h |grad C| above ``surface`` lie at a free surface and stay: there the gradient points out of the fluid (0.74 on a
+    plane surface for Wendland C2, 0.03 two spacings below).
     """
     speed = square_length(particles.velocity).sqrt().clamp_min(_SPEED_FLOOR)
     if largest:
         speed = particles.per_member(speed, "amax").index_select(0, particles.member)
     amount = per_particle(strength * smoothing_length, particles.member) * speed * per_particle(step, particles.member)
     shift = -amount[:, None] * concentration
+    if surface is not None:
+        steepness = per_particle(smoothing_length, particles.member) * square_length(concentration).sqrt()
+        shift = shift * (steepness < surface)[:, None]
     length = square_length(shift).sqrt()
     return shift * (_SHIFT_CAP / length.clamp_min(_SHIFT_CAP))[:, None]
 
