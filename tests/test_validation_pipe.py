@@ -26,13 +26,13 @@ def errors(across, times, **changes):
 
 
 def test_start_up_at_16_across():
-    """The issue asks for 2 %, a peer states less than 3 % at 20 across; 0.8 % through the start-up was measured."""
-    assert max(errors(16, (0.25, 0.75))) < 0.012
+    """The issue asks for 2 %, a peer states less than 3 % at 20 across; 0.5 % through the start-up was measured."""
+    assert max(errors(16, (0.25, 0.75))) < 0.008
 
 
 @pytest.mark.slow
 def test_order_of_convergence():
-    """At 8, 12, 16, 24 across in the steady state 1.2, 0.5, 0.3, 0.2 %: order 1.6 (1.5 asked for).
+    """At 8, 12, 16, 24 across in the steady state 1.3, 0.6, 0.4, 0.2 %: order 1.6 (1.5 asked for).
 
     With the default h = 1.3 the error levels off at 0.8 %: the viscous sum over 57 neighbours is 1 to 2 % too weak.
     """

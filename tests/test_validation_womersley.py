@@ -41,11 +41,11 @@ def measured(across, periods=1, frames=16):
 
 
 def test_profile_and_phase_at_16_across():
-    """The issue asks for 3 % of the amplitude and 3 degrees: 2.1 % and 0.2 degrees were measured, flow within 0.1 %."""
+    """The issue asks for 3 % of the amplitude and 3 degrees: 1.6 % and 0.2 degrees were measured, flow 0.3 % low."""
     worst, ratio = measured(16)
-    assert worst < 0.025
+    assert worst < 0.02
     assert abs(np.degrees(np.angle(ratio))) < 0.5
-    assert abs(ratio) == pytest.approx(1.0, abs=0.005)
+    assert abs(ratio) == pytest.approx(1.0, abs=0.006)
 
 
 def test_a_body_force_of_time_must_return_one_number_per_axis():
