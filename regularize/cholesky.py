@@ -40,8 +40,13 @@ def factorise(band: torch.Tensor, reach: torch.Tensor) -> bool:
     return True
 
 
-def solve_lower(band: torch.Tensor, reach: torch.Tensor, right: torch.Tensor) -> torch.Tensor:
-    """x (n, k) with L x = right for the factor L that ``factorise`` left in the band."""
+def solve(band: torch.Tensor, reach: torch.Tensor, right: torch.Tensor, *, lower: bool, upper: bool) -> torch.Tensor:
+    """x (n, k) with L x = right, L' x = right or, with both, L L' x = right for the factor L in the band."""
+    x = _solve_lower(band, reach, right) if lower else right
+    return _solve_upper(band, reach, x) if upper else x
+
+
+def _solve_lower(band: torch.Tensor, reach: torch.Tensor, right: torch.Tensor) -> torch.Tensor:
     x = right.clone()
     for start, stop, end in _strips(band, reach):
         lower = _block(band, slice(start, stop), slice(start, stop)).tril()
@@ -51,8 +56,7 @@ def solve_lower(band: torch.Tensor, reach: torch.Tensor, right: torch.Tensor) ->
     return x
 
 
-def solve_upper(band: torch.Tensor, reach: torch.Tensor, right: torch.Tensor) -> torch.Tensor:
-    """x (n, k) with L' x = right."""
+def _solve_upper(band: torch.Tensor, reach: torch.Tensor, right: torch.Tensor) -> torch.Tensor:
     x = right.clone()
     for start, stop, end in reversed(list(_strips(band, reach))):
         for rows, block in _below(band, start, stop, end):

@@ -15,6 +15,7 @@ from .krylov import Solution
 from .operators import System
 from .ordering import Ordering, order
 
+MARGIN = 1e-3  # of the tolerance: a refinement costs little, and small gradients hide errors where penalties are stiff
 SHIFT = 1e-13  # of the largest diagonal entry; a few hundred times the rounding of float64
 
 
@@ -109,7 +110,8 @@ class Factor:
     def __init__(self, band: torch.Tensor, ordering: Ordering) -> None:
         self.ordering, self.band = ordering, band
         self.reach = ordering.reach(len(band) // len(ordering.nodes))
-        if not cholesky.factorise(band, self.reach):
+        self._algebra = native if native.available() and band.is_contiguous() else cholesky
+        if not self._algebra.factorise(band, self.reach):
             raise InvalidInput(
                 "the normal matrix is not positive definite: some coefficients are fixed by no row; give a "
                 "curvature or damping above 0"
@@ -118,8 +120,8 @@ class Factor:
     def solve(self, right: torch.Tensor) -> torch.Tensor:
         """(active, C) or (active, C, k) in solve order -> the same shape."""
         flat = right.reshape(len(self.band), -1).to(self.band.dtype)
-        half = cholesky.solve_lower(self.band, self.reach, flat)
-        return cholesky.solve_upper(self.band, self.reach, half).double().view(right.shape)
+        solved = self._algebra.solve(self.band, self.reach, flat, lower=True, upper=True)
+        return solved.double().view(right.shape)
 
     def spread(self, white: torch.Tensor) -> torch.Tensor:
         """The factor times white (unknowns, k): draws whose covariance is the factored matrix."""
@@ -131,7 +133,7 @@ class Factor:
         """(active, C) Gaussian draw of mean 0 with ``precision`` times the factored matrix as precision."""
         white = torch.randn(len(self.band), 1, generator=generator, dtype=torch.float64)
         # L' x = z gives x the covariance (L L')^-1
-        draw = cholesky.solve_upper(self.band, self.reach, white)
+        draw = self._algebra.solve(self.band, self.reach, white, lower=False, upper=True)
         return draw.view(len(self.ordering.nodes), -1) / precision**0.5
 
     def diagonal(self) -> torch.Tensor:
@@ -197,14 +199,15 @@ def _refine(
     if scale == 0:
         x = prepared.expand(torch.zeros_like(right)).flatten()
         return Solution(x, 0.0, 0, "zero right-hand side", "direct")
-    x = factor.solve(right)
-    before = float("inf")
+    x, best, least = factor.solve(right), None, float("inf")
     for count in range(1, refinements + 2):
         gradient = prepared.gradient(x)
-        relative = float(gradient.norm()) / scale
-        if relative <= tolerance or count == refinements + 1 or not relative < 0.5 * before:
+        relative, before = float(gradient.norm()) / scale, least
+        if relative < least:
+            best, least = x, relative
+        if least <= MARGIN * tolerance or count == refinements + 1 or not relative < 0.5 * before:
             break
-        before = relative
         x = x + factor.solve(gradient)
-    reason = "gradient below tolerance" if relative <= tolerance else "refinement stalled"
-    return Solution(prepared.expand(x).flatten(), relative, count, reason, "direct")
+    best = x if best is None else best
+    reason = "gradient below tolerance" if least <= tolerance else "refinement stalled"
+    return Solution(prepared.expand(best).flatten(), least, count, reason, "direct")

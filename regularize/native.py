@@ -1,4 +1,4 @@
-"""The compiled assembly (csrc/spline.cpp) behind the same calls as the torch reference.
+"""The compiled assembly (csrc/spline.cpp) and band algebra (csrc/band.cpp) behind the calls of the torch reference.
 
 Install builds three shared libraries (see native_build.py); the best one that the processor can run is
 loaded at first use. ``available()`` says whether there is one, ``require()`` why there is none.
@@ -59,7 +59,7 @@ def library() -> ctypes.CDLL | None:
         level = LEVELS[ctypes.CDLL(str(portable)).spline_cpu_level()]
     chosen = folder / f"_native_{level}.so"
     lib = ctypes.CDLL(str(chosen if chosen.exists() else portable))
-    for name in ("spline_gram", "spline_apply", "spline_adjoint", "spline_set_threads"):
+    for name in ("spline_gram", "spline_gradient", "spline_set_threads", "spline_solve_f64", "spline_solve_f32"):
         getattr(lib, name).restype = None
     return lib
 
@@ -67,6 +67,32 @@ def library() -> ctypes.CDLL | None:
 def available() -> bool:
     """Whether a compiled library was built with this install."""
     return library() is not None
+
+
+def _address(tensor: torch.Tensor | None) -> ctypes.c_void_p:
+    return ctypes.c_void_p(None if tensor is None else tensor.data_ptr())
+
+
+def _size(band: torch.Tensor) -> tuple[ctypes.c_void_p, ctypes.c_int64, ctypes.c_int64]:
+    return _address(band), ctypes.c_int64(len(band)), ctypes.c_int64(band.shape[1])
+
+
+def factorise(band: torch.Tensor, reach: torch.Tensor) -> bool:
+    """As :func:`regularize.cholesky.factorise`."""
+    lib = library()
+    lib.spline_set_threads(torch.get_num_threads())
+    run = lib.spline_factor_f64 if band.dtype == torch.float64 else lib.spline_factor_f32
+    return bool(run(*_size(band), _address(reach)))
+
+
+def solve(band: torch.Tensor, reach: torch.Tensor, right: torch.Tensor, *, lower: bool, upper: bool) -> torch.Tensor:
+    """x (n, k) with L x = right, L' x = right or, with both, L L' x = right for the factor L in the band."""
+    lib, x = library(), right.T.contiguous().clone()
+    lib.spline_set_threads(torch.get_num_threads())
+    run = lib.spline_solve_f64 if band.dtype == torch.float64 else lib.spline_solve_f32
+    parts = ctypes.c_int32(lower + 2 * upper)
+    run(*_size(band), _address(reach), parts, ctypes.c_int64(len(x)), _address(x))
+    return x.T.contiguous()
 
 
 class PackedSystem:
@@ -105,9 +131,9 @@ class PackedSystem:
             ctypes.byref(self.grid),
             blocks,
             ctypes.c_int32(len(self.rows)),
-            ctypes.c_void_p(slabs.data_ptr()),
+            _address(slabs),
             ctypes.c_int64(len(slabs) - 1),
-            ctypes.c_void_p(band.data_ptr()),
+            _address(band),
             ctypes.c_int64(band.shape[1]),
         )
         return band
@@ -115,24 +141,19 @@ class PackedSystem:
     def gradient(self, x: torch.Tensor | None) -> torch.Tensor:
         """A'(b - A x) - damping^2 x; A'b where x is None. x and the result (active, C) in solve order."""
         out = torch.zeros(self.grid.nodes, self.grid.components, dtype=torch.float64)
+        x = None if x is None else x.contiguous()
+        self.lib.spline_set_threads(torch.get_num_threads())
         for block, rows, index in zip(self.system.blocks, self.rows, self.sorted, strict=True):
             if isinstance(block, CellRows):
                 if x is not None:
                     self._subtract_cells(block, index, x, out)
                 continue
-            if x is None and not bool(block.target.any()):
-                continue  # divergence rows add nothing to the right-hand side
-            residual = block.target.double().view(len(block), -1)[index].contiguous()
-            if x is not None:
-                fitted = torch.empty_like(residual)
-                self.lib.spline_apply(*self._call(rows, x, fitted))
-                residual -= fitted
-            self.lib.spline_adjoint(*self._call(rows, residual, out))
+            # divergence rows have no target and add nothing to the right-hand side
+            target = None if isinstance(block, DivergenceRows) else block.target.double().contiguous()
+            if x is not None or target is not None:
+                given = (_address(each) for each in (target, index, x, out))
+                self.lib.spline_gradient(ctypes.byref(self.grid), ctypes.byref(rows), *given)
         return out if x is None else out - self.system.damping**2 * x
-
-    def _call(self, rows: _Rows, given: torch.Tensor, out: torch.Tensor) -> tuple:
-        pointers = (ctypes.c_void_p(given.data_ptr()), ctypes.c_void_p(out.data_ptr()))
-        return ctypes.byref(self.grid), ctypes.byref(rows), *pointers
 
     def _subtract_cells(
         self, block: CellRows, slots: torch.Tensor, x: torch.Tensor, out: torch.Tensor

@@ -1,16 +1,16 @@
-"""Compiles csrc/spline.cpp into one shared library per instruction set; the build backend calls build()."""
+"""Compiles csrc/*.cpp into one shared library per instruction set; the build backend calls build()."""
 
 import platform
 import shutil
 import subprocess
 from pathlib import Path
 
-SOURCE = Path(__file__).parent / "csrc" / "spline.cpp"
+SOURCES = tuple(sorted((Path(__file__).parent / "csrc").glob("*.cpp")))
 FLAGS = ("-O3", "-fopenmp", "-fPIC", "-shared", "-std=c++17", "-fno-math-errno", "-ffp-contract=fast")
 VARIANTS = {"base": (), "avx2": ("-mavx2", "-mfma"), "avx512": ("-mavx512f", "-mavx512dq", "-mavx2", "-mfma")}
 
 
-def build(out_dir: Path | str, *, source: Path | str = SOURCE, compiler: str | None = None) -> list[Path]:
+def build(out_dir: Path | str, *, compiler: str | None = None) -> list[Path]:
     """Compile every variant that this machine's compiler can make into ``out_dir``; returns the files.
 
     ``compiler`` None takes g++, or else clang++. Raises FileNotFoundError without a compiler and
@@ -26,7 +26,7 @@ def build(out_dir: Path | str, *, source: Path | str = SOURCE, compiler: str | N
     made = []
     for name in names:
         target = out_dir / f"_native_{name}.so"
-        command = [compiler, *FLAGS, *VARIANTS[name], str(source), "-o", str(target)]
+        command = [compiler, *FLAGS, *VARIANTS[name], *map(str, SOURCES), "-o", str(target)]
         subprocess.run(command, check=True, capture_output=True, text=True)
         made.append(target)
     return made

@@ -9,7 +9,7 @@ import pytest
 import torch
 from scipy.special import j0
 
-from torchsph import XSPH, GammaRamp, PotentialWall, Scene, Simulator, preset, simulator
+from torchsph import XSPH, GammaRamp, PotentialWall, Scene, Simulator, preset, simulation
 from torchsph.particles import Particles
 from torchsph.scene import Fluid
 from torchsph.smoothing import kernel
@@ -228,8 +228,8 @@ def test_sorting_in_space_leaves_the_caller_its_particles(monkeypatch):
     start = particles_at(place, torch.randn((256, 2), generator=generator, dtype=torch.float64), members=2)
     ends = []
     for least in (10**9, 0):
-        monkeypatch.setattr(simulator, "_SORT_FROM", least)
-        monkeypatch.setattr(simulator, "_SORT_EVERY", 2)
+        monkeypatch.setattr(simulation, "_SORT_FROM", least)
+        monkeypatch.setattr(simulation, "_SORT_EVERY", 2)
         run = Simulator(scene, preset("default"), dtype=torch.float64).resume(start, 0.0)
         for k in range(1, 4):
             run.advance(0.01 * k)

@@ -31,19 +31,29 @@ def kernel_share(field, step, h):
     return KernelShare(field.shape, step, WENDLAND, h, torch.float64).at(field)
 
 
-@pytest.mark.parametrize("distance", [0.0, 0.4, 1.0, 2.0])
-def test_share_behind_a_plane_equals_the_analytic_half_space_integral(distance):
-    """Share within 1 %, its gradient within 2 % of the largest slope, at the look-up spacing of the simulator."""
+def test_share_behind_a_tilted_plane_equals_the_analytic_half_space_integral():
+    """As looked up between the nodes: on the average over places within 0.2 % of the kernel, anywhere within 1 %.
+
+    The gradient, which transmits the wall's friction: 1 and 3.5 % of its largest value. Values that are right at the
+    nodes, instead of on the average between them, put it 4 % too low at the wall, and a pipe flow 0.5 % too fast.
+    """
     h, step = 1.3, 0.5
-    z = torch.arange(-6.0, 6.0 + step, step, dtype=torch.float64) + 0.13
-    field = z[:, None, None].expand(-1, 9, 9)  # distance from the plane z = 0
-    share, gradient = kernel_share(field, step, h)
-    at = int((z - distance).abs().argmin())
-    expected, slope = half_space_share(float(z[at]), h)
-    assert float(share[0, at, 4, 4]) == pytest.approx(expected, abs=0.01)
+    normal = torch.tensor([0.36, 0.48, 0.8], dtype=torch.float64)
+    axis = torch.arange(-7.0, 7.0 + step, step, dtype=torch.float64)
+    grid = geometry.Grid((-7.0,) * 3, (step,) * 3, (len(axis),) * 3)
+    share, gradient = kernel_share((grid.nodes() @ normal).reshape(grid.shape), step, h)
+    aside = torch.rand((400, 3), generator=torch.Generator().manual_seed(0), dtype=torch.float64) * 4 - 2
+    aside = aside - (aside @ normal)[:, None] * normal
     largest = half_space_share(0.0, h)[1]
-    assert float(gradient[2, at, 4, 4]) == pytest.approx(slope, abs=0.02 * largest)
-    assert gradient[:2, at, 4, 4].abs().max() < 1e-10
+    for distance in (0.0, 0.4, 1.0, 2.0):
+        values = grid.sample(torch.cat([share, gradient]), aside + distance * normal)
+        expected, slope = half_space_share(distance, h)
+        assert float(values[0].mean()) == pytest.approx(expected, abs=0.002)
+        assert (values[0] - expected).abs().max() < 0.01
+        along = normal @ values[1:]
+        assert float(along.mean()) == pytest.approx(slope, abs=0.01 * largest)
+        assert (along - slope).abs().max() < 0.035 * largest
+        assert (values[1:] - along * normal[:, None]).abs().max() < 0.035 * largest
 
 
 def test_share_in_a_right_angled_edge_is_a_quarter():

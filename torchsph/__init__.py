@@ -24,7 +24,8 @@ from .schemes import (
     preset,
 )
 from .seeding import Seeding
-from .simulator import NumericalFailure, Simulation, Simulator
+from .simulation import NumericalFailure, Simulation
+from .simulator import Simulator
 from .smooth import smooth
 from .smoothing import KERNELS, SmoothingKernel, kernel
 

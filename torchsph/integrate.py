@@ -16,7 +16,8 @@ from .particles import Particles
 from .schemes import CompleteKernelWall, PotentialWall, WeaklyCompressible
 from .second_order import predictor_corrector_step, verlet_step
 from .smoothing import kernel
-from .terms import shifting_displacement, softened_share, tait_pressure
+from .terms import mls_deviation, shepard_deviation, shifting_displacement, softened_share, tait_pressure
+from .transfer import solve_small
 from .walls import WallSample, friction, potential_force, retardation, wall_pressure_force
 
 # a particle whose kernel lies almost wholly behind walls would divide by nothing
@@ -47,9 +48,11 @@ class Stepper:
     """Steps particles with one scheme; holds no state but the neighbour list and the coefficients in use."""
 
     def __init__(
-        self, scheme: WeaklyCompressible, coefficients: Coefficients, search: PairSearch, dimension: int
+        self, scheme: WeaklyCompressible, coefficients: Coefficients, search: PairSearch, dimension: int,
+        *, buffered: bool = True,
     ) -> None:
-        self.scheme, self.pair_search, self.dimension = scheme, search, dimension
+        """``buffered``: whether there can be particles of reservoirs, which are not the stepper's to move."""
+        self.scheme, self.pair_search, self.dimension, self._buffered = scheme, search, dimension, buffered
         self.use(coefficients)
 
     def use(self, coefficients: Coefficients) -> None:
@@ -67,8 +70,9 @@ class Stepper:
             pressure=scheme.pressure, artificial=coefficients.artificial, laminar=laminar,
             tensile=scheme.tensile,
         )
+        self._corrected = coefficients.diffusion is not None and scheme.diffusion_form == "corrected"
         self._rate_terms = RateTerms(
-            continuity=scheme.continuity, diffusion=coefficients.diffusion is not None,
+            continuity=scheme.continuity, diffusion=coefficients.diffusion is not None and not self._corrected,
             concentration=coefficients.shifting is not None, xsph=moves and not self._centroid,
         )
 
@@ -96,13 +100,12 @@ class Stepper:
         wall, seen = around.sample(particles), particles
         pairs = self.pair_search.at(particles)
         filtering = self._filter_due(number, step)
-        terms = self._rate_terms if filtering is None else replace(self._rate_terms, shepard=True)
-        rates = self.pair_search.backend.rates(pairs, self._pressureless(particles), self.support, terms)
+        terms = self._rate_terms if filtering is None else self._with_filter(self._rate_terms)
+        rates = self._rates(particles, pairs, terms)
         compression, crowding = self._complete(particles, rates, wall)
         particles = self._new_density(particles, rates, compression, dt, filtering)
         acceleration = self.acceleration(particles, pairs, compression, wall, around)
-        fluid = particles.fluid[:, None]
-        velocity = torch.where(fluid, particles.velocity + dt[:, None] * acceleration, particles.velocity)
+        velocity = self.kicked(particles, particles.velocity, dt, acceleration)
         particles = self.retarded(particles.changed(velocity=velocity), wall, dt)
         drift = dt[:, None] * particles.velocity + self.wandering(particles, rates, crowding, step, seen)
         return particles.changed(position=particles.position + drift), acceleration, wall
@@ -121,9 +124,20 @@ class Stepper:
         if crowding is not None:
             drift = drift + shifting_displacement(
                 particles, crowding, step, self.coefficients.smoothing_length, self.coefficients.shifting,
-                self.scheme.shifting_speed == "largest",
+                self.scheme.shifting_speed == "largest", self.scheme.shifting_surface,
             )
-        return torch.where(particles.fluid[:, None], drift, torch.zeros_like(drift))
+        return self._of_fluid(particles, drift)
+
+    def kicked(self, particles: Particles, velocity: Tensor, dt: Tensor, acceleration: Tensor) -> Tensor:
+        """Velocities (N, D) after a kick; the buffers of reservoirs keep theirs."""
+        return velocity + self._of_fluid(particles, dt[:, None] * acceleration)
+
+    def _of_fluid(self, particles: Particles, values: Tensor) -> Tensor:
+        """Values (N, ...) of the fluid's particles and 0 for those of reservoirs."""
+        if not self._buffered:
+            return values
+        fluid = particles.fluid.reshape(-1, *[1] * (values.ndim - 1))
+        return torch.where(fluid, values, torch.zeros_like(values))
 
     def _pull(self, particles: Particles, plain: Tensor | None) -> Tensor:
         """XSPH's sum (N, D), ``plain`` where it is the full one without confidences.
@@ -143,7 +157,7 @@ class Stepper:
 
     def evaluate_rates(self, particles: Particles, pairs: Any, wall: WallSample | None) -> RateSums:
         """Density rate and its companions at one state."""
-        sums = self.pair_search.backend.rates(pairs, self._pressureless(particles), self.support, self._rate_terms)
+        sums = self._rates(particles, pairs, self._rate_terms)
         divergence, crowding = self._complete(particles, sums, wall)
         return RateSums(self._density_rate(particles, sums, divergence), divergence, crowding, sums)
 
@@ -158,7 +172,7 @@ class Stepper:
         backend = self.pair_search.backend
         pairs = self.pair_search.at(particles)
         wall = around.sample(particles) if isinstance(self.scheme.wall, CompleteKernelWall) else None
-        rates = backend.rates(pairs, self._pressureless(particles), self.support, self._rate_terms)
+        rates = self._rates(particles, pairs, self._rate_terms)
         compression, _ = self._complete(particles, rates, wall)
         particles = self._new_density(particles, rates, compression, dt)
         particles = particles.changed(position=particles.position + dt[:, None] * particles.velocity)
@@ -170,7 +184,8 @@ class Stepper:
         smoothing = self.velocity_xsph is not None
         if smoothing or filtering is not None:
             plain = smoothing and not self._centroid and particles.confidence is None
-            wanted = RateTerms(continuity=None, xsph=plain, shepard=filtering is not None)
+            wanted = RateTerms(continuity=None, xsph=plain)
+            wanted = wanted if filtering is None else self._with_filter(wanted)
             state = particles
             sums = backend.rates(pairs, self._pressureless(state), self.support, wanted)
             if smoothing:
@@ -179,7 +194,7 @@ class Stepper:
                 share = share[:, None] if isinstance(share, Tensor) else share
                 particles = particles.changed(velocity=particles.velocity + share * pull)
             if filtering is not None:
-                particles = particles.changed(deviation=_filtered(particles, sums, filtering))
+                particles = particles.changed(deviation=self._filtered(particles, sums, filtering))
         return particles, acceleration, wall
 
     def _filter_due(self, number: Tensor, step: Tensor) -> Tensor | None:
@@ -189,6 +204,26 @@ class Stepper:
             return None
         due = (number % period == 0) & (step > 0)
         return due if bool(due.any()) else None
+
+    def _with_filter(self, terms: RateTerms) -> RateTerms:
+        """With the sums that the filter of the density needs."""
+        return replace(terms, shepard=True, moments=self.scheme.density_filter == "mls")
+
+    def _filtered(self, particles: Particles, sums: Rates, due: Tensor) -> Tensor:
+        """Density deviation (N,) after the filter, in the members where ``due`` (members,)."""
+        smooth = mls_deviation(sums) if self.scheme.density_filter == "mls" else shepard_deviation(sums)
+        return torch.where(due[particles.member], smooth, particles.deviation)
+
+    def _rates(self, particles: Particles, pairs: Any, terms: RateTerms) -> Rates:
+        """First-pass sums, with the diffusion in the scheme's form."""
+        backend, state = self.pair_search.backend, self._pressureless(particles)
+        if not self._corrected:
+            return backend.rates(pairs, state, self.support, terms)
+        sums = backend.rates(pairs, state, self.support, replace(terms, gradient=True, renormalisation=True))
+        slope = solve_small(sums.renormalisation, sums.gradient[:, :, None])[:, :, 0]
+        second = RateTerms(None, corrected_diffusion=True)
+        spread = backend.rates(pairs, replace(state, slope=slope), self.support, second).diffusion
+        return replace(sums, diffusion=spread)
 
     @staticmethod
     def _pressureless(particles: Particles) -> Any:
@@ -220,7 +255,7 @@ class Stepper:
     ) -> Particles:
         deviation = particles.deviation + dt * self._density_rate(particles, rates, divergence)
         if filtering is not None:
-            deviation = _filtered(particles.changed(deviation=deviation), rates, filtering)
+            deviation = self._filtered(particles.changed(deviation=deviation), rates, filtering)
         return particles.changed(deviation=deviation)
 
     def _density_rate(self, particles: Particles, rates: Rates, divergence: Tensor) -> Tensor:
@@ -238,12 +273,13 @@ class Stepper:
         """
         c, member = self.coefficients, particles.member
         sound = per_particle(c.sound_speed, member)
-        pressure = tait_pressure(particles.deviation, sound, per_particle(c.gamma, member))
+        deviation = particles.deviation.clamp_min(0.0) if self.scheme.hughes_graham else particles.deviation
+        pressure = tait_pressure(deviation, sound, per_particle(c.gamma, member))
         if self.scheme.pressure == "symmetric" and c.background is not None:
             pressure = pressure + per_particle(c.background, member) * sound**2
         if c.bulk_damping is not None and divergence is not None:
             damping = per_particle(c.bulk_damping * c.sound_speed * c.smoothing_length, member) * divergence
-            pressure = pressure - torch.where(particles.fluid, damping, torch.zeros_like(damping))
+            pressure = pressure - self._of_fluid(particles, damping)
         return pressure
 
     def acceleration(
@@ -274,9 +310,3 @@ class Stepper:
         sound = per_particle(self.coefficients.sound_speed, particles.member)
         velocity = retardation(model, sound, dt, particles.velocity, wall)
         return particles.changed(velocity=torch.where(particles.fluid[:, None], velocity, particles.velocity))
-
-
-def _filtered(particles: Particles, sums: Rates, due: Tensor) -> Tensor:
-    """Density deviation after the Shepard filter (2.20) of the members where ``due`` (members,)."""
-    smooth = sums.shepard_mass / sums.shepard_volume - 1.0
-    return torch.where(due[particles.member], smooth, particles.deviation)

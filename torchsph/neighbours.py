@@ -7,7 +7,7 @@ from typing import Any
 
 from torch import Tensor
 
-from .pairs.interface import Backend
+from .pairs.interface import Backend, square_length
 from .particles import Particles
 
 
@@ -29,7 +29,7 @@ class PairSearch:
             return True
         if particles.count == 0:
             return False
-        moved = (particles.position - self.made_at).square().sum(1).amax().item()
+        moved = square_length(particles.position - self.made_at).amax().item()
         return not moved < (0.5 * self.margin) ** 2
 
     def at(self, particles: Particles) -> Any:

@@ -154,18 +154,23 @@ class WeaklyCompressible:
         sound_speed: numerical speed of sound, m/s.
         gamma: exponent of the Tait equation (2.25). gamma_ramp: how it grows after an imposition, or None.
         background_pressure: p0 / rho0 in units of c^2 (0: none).
+        hughes_graham: whether p of 2.25 is taken at max(rho, rho0) (Hughes & Graham 2010): a fluid that cannot pull.
         continuity: "volume" or "mass" (2.19) form of the density rate.
         pressure: form of the pressure force (``MomentumTerms``).
         artificial_viscosity: alpha of 2.29, or None.
         laminar_viscosity: whether the viscosity of the scene's fluid acts (Morris et al. 1997).
-        density_diffusion: delta of delta-SPH (Molteni & Colagrossi 2009), or None.
+        density_diffusion: delta of delta-SPH, or None. diffusion_form: "plain" (Molteni & Colagrossi 2009) or
+            "corrected" (Antuono et al. 2010: leaves a linear density alone, at two more passes a step).
         xsph: velocity smoothing, or None.
         shifting: strength of the particle shifting (Lind et al. 2012 with the speed of the particle), or None.
         bulk_damping: coefficient of a pressure -b c h div v that damps sound, or None.
-        shepard_period: steps between Shepard filters of the density (2.20), or None.
+        shepard_period: steps between filters of the density, or None. density_filter: "shepard" (2.20), or "mls", which
+            leaves a linear density alone (Colagrossi & Landrini 2003 eqs. 12-14).
         wall: wall model for scenes with walls; valve: valve model for scenes with valves (None: stays shut).
         shifting_speed: the speed in the shifting: "local" (the particle's own) or "largest" (of its member: also
             stagnation points are evened out, which a vortex needs and a jet in a resting chamber does not).
+        shifting_surface: h times the crowding gradient above which a particle counts as one of a free surface and is
+            not shifted (Lind et al. 2012 section 3.4 in its simplest form), or None: all are.
         tensile: R of Monaghan's tensile correction (2000; 0.2 there, symmetric pressure form only), or None.
         order: "thesis" steps as algorithm 1; "symplectic" evaluates both passes at one position (symplectic Euler);
             "verlet" is the position Verlet scheme, "predictor_corrector" the symplectic predictor-corrector, both of
@@ -182,17 +187,21 @@ class WeaklyCompressible:
     sound_speed: float = 5.0
     gamma: float = 1.0
     background_pressure: float = 0.0
+    hughes_graham: bool = False
     continuity: str = "volume"
     pressure: str = "switched"
     artificial_viscosity: float | None = 0.02
     laminar_viscosity: bool = True
     density_diffusion: float | None = 0.1
+    diffusion_form: str = "plain"
     xsph: XSPH | None = None
     shifting: float | None = 0.5
     shifting_speed: str = "local"
+    shifting_surface: float | None = None
     tensile: float | None = None
     bulk_damping: float | None = 0.3
     shepard_period: int | None = None
+    density_filter: str = "shepard"
     wall: PotentialWall | CompleteKernelWall = field(default_factory=CompleteKernelWall)
     valve: PressureSource | Reservoir | None = field(default_factory=Reservoir)
     order: str = "symplectic"
@@ -213,7 +222,8 @@ class WeaklyCompressible:
                 raise ValueError(f"WeaklyCompressible.{name} must not be negative, got {value}")
         for name, known in (
             ("continuity", CONTINUITY_FORMS), ("pressure", PRESSURE_FORMS), ("order", ORDERS),
-            ("shifting_speed", ("local", "largest")),
+            ("shifting_speed", ("local", "largest")), ("diffusion_form", ("plain", "corrected")),
+            ("density_filter", ("shepard", "mls")),
         ):
             if getattr(self, name) not in known:
                 raise ValueError(f"WeaklyCompressible.{name} must be one of {known}, got '{getattr(self, name)}'")
@@ -235,6 +245,11 @@ class WeaklyCompressible:
         if self.xsph is not None and self.xsph.level == "velocity" and self.order != "thesis":
             raise ValueError(
                 f"XSPH of level 'velocity' belongs to order 'thesis', got order '{self.order}'; use level 'position'"
+            )
+        if self.shifting_surface is not None and not (self.shifting_surface > 0 and self.shifting is not None):
+            raise ValueError(
+                "WeaklyCompressible.shifting_surface must be positive and needs shifting, got "
+                f"{self.shifting_surface} with shifting {self.shifting}"
             )
         if self.shepard_period is not None and self.order not in ("thesis", "symplectic"):
             raise ValueError(f"the Shepard filter needs order 'thesis' or 'symplectic', got '{self.order}'")

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-import torch
 from torch import Tensor
 
 from .pairs.interface import per_particle
@@ -33,7 +32,7 @@ def verlet_step(
     early = stepper.evaluate_rates(middle, pairs, wall)
     middle = middle.changed(deviation=start.deviation + 0.5 * dt * early.rate)
     acceleration = stepper.acceleration(middle, pairs, early.divergence, wall, around)
-    velocity = _kicked(start, start.velocity, dt, acceleration)
+    velocity = stepper.kicked(start, start.velocity, dt, acceleration)
     mean = middle.changed(velocity=0.5 * (start.velocity + velocity))
     late = stepper.evaluate_rates(mean, pairs, wall)
     drift = 0.5 * dt[:, None] * velocity + stepper.wandering(mean, late.sums, late.crowding, step, mean)
@@ -56,21 +55,16 @@ def predictor_corrector_step(
     push = stepper.acceleration(start, pairs, first.divergence, begin, around)
     middle = start.changed(
         position=start.position + half[:, None] * start.velocity,
-        velocity=_kicked(start, start.velocity, half, push),
+        velocity=stepper.kicked(start, start.velocity, half, push),
         deviation=start.deviation + half * first.rate,
     )
     pairs, wall = stepper.pair_search.at(middle), around.sample(middle)
     second = stepper.evaluate_rates(middle, pairs, wall)
     acceleration = stepper.acceleration(middle, pairs, second.divergence, wall, around)
-    velocity = _kicked(start, start.velocity, dt, acceleration)
+    velocity = stepper.kicked(start, start.velocity, dt, acceleration)
     drift = half[:, None] * (start.velocity + velocity)
     drift = drift + stepper.wandering(middle, second.sums, second.crowding, step, middle)
     after = start.changed(
         position=start.position + drift, velocity=velocity, deviation=start.deviation + dt * second.rate
     )
     return stepper.retarded(after, wall, dt), acceleration, begin
-
-
-def _kicked(particles: Particles, velocity: Tensor, dt: Tensor, acceleration: Tensor) -> Tensor:
-    """Velocities of the fluid after a kick; buffers keep theirs."""
-    return torch.where(particles.fluid[:, None], velocity + dt[:, None] * acceleration, velocity)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from .pairs.interface import square_length
 from .parameters import Coefficients
 from .particles import Particles
 from .record import Record
@@ -29,8 +30,8 @@ class StepControl:
             factor: (members,) that the limits are multiplied by, or None. All in internal units.
         """
         c, record = coefficients, self._record
-        speed = particles.per_member(particles.velocity.norm(dim=1), "amax")
-        force = particles.per_member(acceleration.norm(dim=1), "amax")
+        speed = particles.per_member(square_length(particles.velocity), "amax").sqrt()
+        force = particles.per_member(square_length(acceleration), "amax").sqrt()
         viscosity = 0.0 if c.viscosity is None else c.viscosity
         limits = step_limits(speed, force, c.smoothing_length, c.sound_speed, viscosity, c.courant).double()
         active = left > 0

@@ -5,10 +5,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from .pairs.interface import per_particle
+from .pairs.interface import Rates, per_particle, square_length
 from .pairs.reference import SINGULARITY
 from .particles import Particles
 from .smoothing import SmoothingKernel
+from .transfer import solve_small
 
 # names of the time-step limits, in the order of ``step_limits``
 LIMITS = ("acoustic", "viscous", "force", "frame", "end of interval")
@@ -41,6 +42,21 @@ def step_limits(
     return torch.stack([acoustic.expand_as(speed), viscous, force])
 
 
+def shepard_deviation(sums: Rates) -> Tensor:
+    """Density deviation (N,) after Shepard's filter (2.20)."""
+    return sums.shepard_mass / sums.shepard_volume - 1.0
+
+
+def mls_deviation(sums: Rates) -> Tensor:
+    """Density deviation (N,) of moving least squares (Colagrossi & Landrini 2003 eqs. 12-14; Dilts 1999).
+
+    Exact for a linear density; where the neighbours lie in a line or plane, Shepard's value.
+    """
+    tilt = -solve_small(sums.moment_second, sums.moment_first[:, :, None])[:, :, 0]
+    volume = sums.shepard_volume + (tilt * sums.moment_first).sum(1)
+    return (sums.shepard_mass + (tilt * sums.moment_mass).sum(1)) / volume - 1.0
+
+
 def softened_share(kernel: SmoothingKernel, dimension: int) -> float:
     """Part of the viscosity that acts, because the pair term has r^2 / (r^2 + 0.01 h^2) against coinciding particles.
 
@@ -54,21 +70,26 @@ def softened_share(kernel: SmoothingKernel, dimension: int) -> float:
 
 def shifting_displacement(
     particles: Particles, concentration: Tensor, step: Tensor, smoothing_length: float | Tensor,
-    strength: float | Tensor, largest: bool = False,
+    strength: float | Tensor, largest: bool = False, surface: float | None = None,
 ) -> Tensor:
     """Displacement -A h |v| dt grad C that evens out the particles (Lind et al. 2012, speed-limited form), (N, D).
 
     A floor on the speed keeps a resting fluid from freezing in disorder; a cap of a tenth of a spacing keeps the
     shift below anything that the velocity would have to be corrected for. With ``largest`` the speed is the largest
-    of the member (Sun et al. 2017 eq. 14), so that stagnation points are evened out as well.
+    of the member (Sun et al. 2017 eq. 14), so that stagnation points are evened out as well. Particles with
+    h |grad C| above ``surface`` lie at a free surface and stay: there the gradient points out of the fluid (0.74 on a
+    plane surface for Wendland C2, 0.03 two spacings below).
     """
-    speed = particles.velocity.norm(dim=1).clamp_min(_SPEED_FLOOR)
+    speed = square_length(particles.velocity).sqrt().clamp_min(_SPEED_FLOOR)
     if largest:
         speed = particles.per_member(speed, "amax").index_select(0, particles.member)
     amount = per_particle(strength * smoothing_length, particles.member) * speed * per_particle(step, particles.member)
     shift = -amount[:, None] * concentration
-    length = shift.norm(dim=1, keepdim=True)
-    return shift * (_SHIFT_CAP / length.clamp_min(_SHIFT_CAP))
+    if surface is not None:
+        steepness = per_particle(smoothing_length, particles.member) * square_length(concentration).sqrt()
+        shift = shift * (steepness < surface)[:, None]
+    length = square_length(shift).sqrt()
+    return shift * (_SHIFT_CAP / length.clamp_min(_SHIFT_CAP))[:, None]
 
 
 _QUADRATURE = 4001

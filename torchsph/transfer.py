@@ -50,12 +50,12 @@ def first_order_value(
     # eliminate a: (M2 - m1 m1' / m0) b = m1A - m1 m0A / m0
     spread = moment2 - moment1[:, :, None] * moment1[:, None, :] / safe[:, None, None]
     right = value1 - moment1[:, :, None] * mean[:, None, :]
-    slope = _solve_small(spread, right)
+    slope = solve_small(spread, right)
     value = mean - (moment1[:, :, None] * slope).sum(1) / safe[:, None]
     return torch.where(moment0[:, None] > 0, value, torch.zeros_like(value))
 
 
-def _solve_small(matrix: Tensor, right: Tensor) -> Tensor:
+def solve_small(matrix: Tensor, right: Tensor) -> Tensor:
     """Solve (M, D, D) x = (M, D, C) for D = 2, 3 by cofactors (a batched LAPACK call costs ten times as much).
 
     Symmetric, not negative; where the matrix is nearly singular (``_LEAST_ROUNDNESS``) the answer is 0.

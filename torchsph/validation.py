@@ -91,3 +91,8 @@ CHANNEL_OPTIONS = {"smoothing_ratio": 2.0, "sound_speed": 10.0, "artificial_visc
 # Free surfaces: the switched pressure form is not conservative and feeds energy into a surface under tension (Sun et
 # al. 2017 keep the sum there), and shifting pushes particles out of it.
 FREE_SURFACE_OPTIONS = {"pressure": "sum", "shifting": None, "sound_speed": 10.0}
+# A stretched fluid (a rotating patch) tears from tensile instability by omega t = 1 unless it is evened out below its
+# surface; where a vacuum shall open, this shifting would fill it.
+STRETCHED_SURFACE_OPTIONS = FREE_SURFACE_OPTIONS | {
+    "shifting": 4.0, "shifting_speed": "largest", "shifting_surface": 0.15,
+}  # fmt: skip

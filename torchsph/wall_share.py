@@ -16,7 +16,7 @@ class KernelShare:
 
     The fluid's indicator, smoothed over one cell as a plane wall would be, is convolved with the kernel and with its
     gradient; edges, gaps and curvature are therefore contained (Ferrand et al. 2013 evaluate the same integrals face
-    by face).
+    by face). The nodes' values are such that multilinear interpolation between them is right on the average.
 
     Args:
         shape: of the grid. step: node spacing, in the unit of ``smoothing_length``.
@@ -38,15 +38,31 @@ class KernelShare:
 
         ``distance`` (*shape): signed, positive in the fluid, in the unit of the step; beyond the grid it continues.
         """
-        indicator = (0.5 + distance.to(self.dtype) / self.step).clamp(0.0, 1.0)
-        padded = functional.pad(indicator[None, None], (self._reach,) * (2 * indicator.ndim), mode="replicate")[0]
-        spectrum = torch.fft.rfftn(padded, s=self._size, dim=self._axes)
-        inner = (0, *(slice(2 * self._reach, 2 * self._reach + n) for n in self.shape))
+        spectrum = self._spectrum(self._indicator(distance))
         # one filter at a time: all at once are too large for the processor's cache
-        share, *gradient = (
-            torch.fft.irfftn(spectrum * one, s=self._size, dim=self._axes)[inner] for one in self._transforms
-        )
+        share, *gradient = (self._back(spectrum * one) for one in self._transforms)
         return share[None].clamp(0.0, 1.0), torch.stack(gradient)
+
+    def swept(self, distance: Tensor, speed: Tensor, normal: Tensor) -> Tensor:
+        """Integral of the kernel times the wall's normal speed over its surface, (1, *shape).
+
+        Args:
+            speed: (*shape) of the nearest wall point along ``normal`` (D, *shape), which points into the fluid.
+        """
+        slope = torch.stack(torch.gradient(self._indicator(distance))[::-1]) / self.step
+        return self._back(self._spectrum(speed * (normal * slope).sum(0)) * self._transforms[0])[None]
+
+    def _indicator(self, distance: Tensor) -> Tensor:
+        return (0.5 + distance.to(self.dtype) / self.step).clamp(0.0, 1.0)
+
+    def _spectrum(self, field: Tensor) -> Tensor:
+        """Transform of (*shape), continued beyond the grid."""
+        padded = functional.pad(field[None, None], (self._reach,) * (2 * field.ndim), mode="replicate")[0]
+        return torch.fft.rfftn(padded, s=self._size, dim=self._axes)
+
+    def _back(self, spectrum: Tensor) -> Tensor:
+        inner = (0, *(slice(2 * self._reach, 2 * self._reach + n) for n in self.shape))
+        return torch.fft.irfftn(spectrum, s=self._size, dim=self._axes)[inner]
 
 
 def _filters(dimension: int, step: float, kernel: SmoothingKernel, smoothing_length: float) -> Tensor:
@@ -65,13 +81,14 @@ def _filters(dimension: int, step: float, kernel: SmoothingKernel, smoothing_len
 
 
 def _sharpened(filters: Tensor) -> Tensor:
-    """(1 - laplacian / 24) of filters (F, *k), one node larger: undoes the cell-wide smoothing of the indicator.
+    """(1 - laplacian / 8) of filters (F, *k), one node larger: undoes what smooths the look-up.
 
-    A box of one cell passes the wave number k with 1 - k^2 / 24 + ... (k per node), whatever the wall's direction.
+    A box of one cell, the indicator's cut, passes the wave number k (per node) with 1 - k^2 / 24 + ..., whatever the
+    wall's direction; multilinear interpolation passes it with 1 - k^2 / 12 + ... on the average over the cell.
     """
     dimension = filters.ndim - 1
     wide = functional.pad(filters, (1,) * (2 * dimension))
     laplacian = -2.0 * dimension * wide
     for axis in range(1, dimension + 1):
         laplacian = laplacian + wide.roll(1, axis) + wide.roll(-1, axis)
-    return wide - laplacian / 24.0
+    return wide - laplacian / 8.0

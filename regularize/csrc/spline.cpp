@@ -26,6 +26,7 @@ using Vector = double __attribute__((vector_size(kWidth * 8), aligned(8), may_al
 
 constexpr int kRows = 4;              // tile rows held in registers
 constexpr int kCols = 2 * kWidth;     // tile columns: two vectors
+constexpr int kWorthThreads = 4096;   // rows: with fewer the threads' meetings cost more
 constexpr int kDepth = 32;            // points whose stencils are buffered before they are summed
 constexpr int kMaxComponents = 3;
 constexpr int kMaxAxes = 4;
@@ -274,7 +275,7 @@ void spline_gram(const SplineGrid* grid, const SplineRows* blocks, int32_t block
   const SplineGrid& g = *grid;
   const int local = local_size(g);
   for (int parity = 0; parity < 2; ++parity) {
-#pragma omp parallel
+#pragma omp parallel if (g.cells > kWorthThreads / 16)
     {
       CellGram cell(g.components, g.padded);
 #pragma omp for schedule(dynamic, 1)
@@ -296,55 +297,40 @@ void spline_gram(const SplineGrid* grid, const SplineRows* blocks, int32_t block
   }
 }
 
-// out (count or count * C) = rows times x (nodes, C)
-void spline_apply(const SplineGrid* grid, const SplineRows* rows, const double* x, double* out) {
+// out (nodes, C) += rows' (target - rows x), the rows of one block. target in the caller's order, of which number[n] is
+// row n's place; null: zero. x (nodes, C); null: zero.
+void spline_gradient(const SplineGrid* grid, const SplineRows* rows, const double* target, const int64_t* number,
+                     const double* x, double* out) {
   const SplineGrid& g = *grid;
   const int local = local_size(g), c = g.components;
   const bool vector = rows->kind == kVector;
-#pragma omp parallel
+  const int width = vector ? c : 1;  // targets per row
+#pragma omp parallel if (rows->count > kWorthThreads)
   {
-    std::vector<double> row(local), near(size_t(local) * c);
+    std::vector<double> row(size_t(local) * c), near(size_t(local) * c), pulled(size_t(local) * c);
+    std::vector<double> mine(size_t(g.nodes) * c);
 #pragma omp for schedule(static)
-    for (int64_t number = 0; number < g.cells; ++number) {
-      if (rows->start[number] == rows->start[number + 1]) continue;
-      gather(g, g.position + number * local, local, x, near.data());
-      for (int64_t n = rows->start[number]; n < rows->start[number + 1]; ++n) {
+    for (int64_t cell = 0; cell < g.cells; ++cell) {
+      if (rows->start[cell] == rows->start[cell + 1]) continue;
+      if (x) gather(g, g.position + cell * local, local, x, near.data());
+      std::fill(pulled.begin(), pulled.end(), 0.0);
+      for (int64_t n = rows->start[cell]; n < rows->start[cell + 1]; ++n) {
         const Basis basis(g, rows->t + n * g.axes, rows->kind == kDivergence);
-        if (vector) stencil(g, basis, -1, 1.0, row.data());
-        else out[n] = 0;
-        for (int k = 0; k < c; ++k) {
-          if (!vector) row_of(g, *rows, basis, n, k, row.data());
-          const double part = dot(row.data(), near.data() + k * local, local);
-          if (vector) out[n * c + k] = rows->coefficient[n * c + k] * part;
-          else out[n] += part;
+        const double* goal = target ? target + number[n] * width : nullptr;
+        if (vector) {
+          stencil(g, basis, -1, 1.0, row.data());
+          for (int k = 0; k < c; ++k) {
+            const double weight = rows->coefficient[n * c + k];
+            const double fitted = x ? weight * dot(row.data(), near.data() + k * local, local) : 0.0;
+            add_scaled(row.data(), weight * ((goal ? goal[k] : 0.0) - fitted), local, pulled.data() + k * local);
+          }
+        } else {
+          for (int k = 0; k < c; ++k) row_of(g, *rows, basis, n, k, row.data() + k * local);
+          const double fitted = x ? dot(row.data(), near.data(), c * local) : 0.0;
+          add_scaled(row.data(), (goal ? goal[0] : 0.0) - fitted, c * local, pulled.data());
         }
       }
-    }
-  }
-}
-
-// out (nodes, C) += rows' times r (count or count * C)
-void spline_adjoint(const SplineGrid* grid, const SplineRows* rows, const double* r, double* out) {
-  const SplineGrid& g = *grid;
-  const int local = local_size(g), c = g.components;
-  const bool vector = rows->kind == kVector;
-#pragma omp parallel
-  {
-    std::vector<double> row(local), near(size_t(local) * c), mine(size_t(g.nodes) * c);
-#pragma omp for schedule(static)
-    for (int64_t number = 0; number < g.cells; ++number) {
-      if (rows->start[number] == rows->start[number + 1]) continue;
-      std::fill(near.begin(), near.end(), 0.0);
-      for (int64_t n = rows->start[number]; n < rows->start[number + 1]; ++n) {
-        const Basis basis(g, rows->t + n * g.axes, rows->kind == kDivergence);
-        if (vector) stencil(g, basis, -1, 1.0, row.data());
-        for (int k = 0; k < c; ++k) {
-          if (!vector) row_of(g, *rows, basis, n, k, row.data());
-          const double scale = vector ? r[n * c + k] * rows->coefficient[n * c + k] : r[n];
-          add_scaled(row.data(), scale, local, near.data() + k * local);
-        }
-      }
-      scatter_add(g, g.position + number * local, local, near.data(), mine.data());
+      scatter_add(g, g.position + cell * local, local, pulled.data(), mine.data());
     }
 #pragma omp critical
     for (size_t i = 0; i < mine.size(); ++i) out[i] += mine[i];

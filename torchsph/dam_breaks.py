@@ -1,0 +1,80 @@
+"""Two dam breaks that were measured: a column in a plane tank, and SPHERIC's second test in space."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+import geometry
+
+from .scene import Fluid, Scene
+from .simulator import Simulation
+
+GRAVITY = 9.81  # m/s^2
+
+# Column of width a and height 2 a: surge front x / a (second row) at t sqrt(2 g / a) (first row), dry bed
+MARTIN_MOYCE_1952 = np.array([
+    [0.849, 1.212, 1.602, 2.283, 2.95, 3.598, 3.905, 4.592, 4.961, 5.316],
+    [1.245, 1.443, 1.884, 2.689, 3.728, 4.528, 4.999, 5.841, 6.271, 6.717],
+])  # fmt: skip
+KOSHIZUKA_OKA_1996 = np.array([
+    [0.0, 0.381, 0.769, 1.153, 1.537, 1.935, 2.323, 2.719, 3.096],
+    [1.0, 1.111, 1.252, 1.505, 1.892, 2.241, 2.615, 3.003, 3.624],
+])  # fmt: skip
+
+# SPHERIC test 2 (Kleefsman et al. 2005 section 6): tank, column, obstacle (lower and upper corner), probes P1, P3; m.
+# The column's corners are rounded to whole particles by the caller.
+OBSTACLE_TANK = ((0.0, -0.5, 0.0), (3.22, 0.5, 1.0))
+OBSTACLE_COLUMN = ((0.0, -0.5, 0.0), (1.228, 0.5, 0.55))
+OBSTACLE = ((2.42, -0.2, 0.0), (2.58, 0.2, 0.161))
+OBSTACLE_PROBES = ((2.42, 0.0, 0.021), (2.42, 0.0, 0.101))
+
+
+def column_scene(spacing: float, width: float = 1.0, *, viscosity: float = 0.001) -> Scene:
+    """A tank of 4 x 4 widths for a column of water of ``width`` (m), twice as high, in its left corner.
+
+    Args:
+        spacing: of the particles, m. viscosity: dynamic, Pa s.
+    """
+    corners = 4.0 * width * np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float64)
+    return Scene(
+        spacing=spacing, fluid=Fluid(1000.0, viscosity), dimension=2, gravity=(0.0, -GRAVITY),
+        walls=geometry.WallMotion.at_rest(geometry.polygon(corners, spacing)),
+        reference_speed=math.sqrt(2 * GRAVITY * 2 * width),
+    )  # fmt: skip
+
+
+def obstacle_scene(spacing: float) -> Scene:
+    """Tank and obstacle of SPHERIC's second test, filled with water; ``spacing`` of the particles, m."""
+    tank = geometry.box(*OBSTACLE_TANK, 2 * spacing)
+    # the obstacle reaches through the floor, so that its bottom is no wall that a particle sees
+    depth = 2 * spacing
+    lower, upper = np.array(OBSTACLE[0]) - (0.0, 0.0, depth), np.array(OBSTACLE[1])
+    block = geometry.box(lower, upper, 2 * spacing)
+    walls = geometry.Surface(
+        np.concatenate([tank.vertices, block.vertices]),
+        np.concatenate([tank.faces, block.faces[:, ::-1] + len(tank.vertices)]),
+    )
+    return Scene(
+        spacing=spacing, fluid=Fluid(1000.0, 0.001), gravity=(0.0, 0.0, -GRAVITY),
+        walls=geometry.WallMotion.at_rest(walls), reference_speed=math.sqrt(2 * GRAVITY * OBSTACLE_COLUMN[1][2]),
+    )  # fmt: skip
+
+
+def surge_front(run: Simulation) -> float:
+    """Where the foremost particle of any member ends, m."""
+    return (float(run.particles.position[:, 0].max()) + 0.5) * run.units.length
+
+
+def front_error(time: np.ndarray, front: np.ndarray, measured: np.ndarray) -> float:
+    """Mean of |computed / measured - 1| over the measured rows inside the times that were computed.
+
+    Args:
+        time: (n,) t sqrt(2 g / a). front: (n,) x / a. measured: (2, m), ``MARTIN_MOYCE_1952`` or the other.
+    """
+    inside = (measured[0] >= time[0]) & (measured[0] <= time[-1])
+    if not inside.any():
+        raise ValueError(f"nothing was measured between {time[0]:g} and {time[-1]:g} t sqrt(2 g / a)")
+    at, expected = measured[:, inside]
+    return float(np.abs(np.interp(at, time, front) / expected - 1.0).mean())
