@@ -18,10 +18,8 @@ from .second_order import predictor_corrector_step, verlet_step
 from .smoothing import kernel
 from .terms import mls_deviation, shepard_deviation, shifting_displacement, softened_share, tait_pressure
 from .transfer import solve_small
-from .walls import WallSample, friction, potential_force, retardation, wall_pressure_force
+from .walls import SMALLEST_SHARE, WallSample, completed, friction, potential_force, retardation, wall_pressure_force
 
-# a particle whose kernel lies almost wholly behind walls would divide by nothing
-_SMALLEST_KERNEL_SHARE = 0.1
 
 
 class Surroundings(Protocol):
@@ -232,23 +230,11 @@ class Stepper:
     def _complete(
         self, particles: Particles, rates: Rates, wall: WallSample | None
     ) -> tuple[Tensor, Tensor | None]:
-        """Velocity divergence and crowding gradient with the part of the kernel behind the wall added.
-
-        Ferrand et al. 2013 eqs. 20-22 with the wall's velocity: the sums are divided by the share of the kernel
-        inside the fluid, and the wall contributes its surface integral.
-        """
+        """Velocity divergence and crowding gradient, complete at walls."""
         divergence = rates.divergence
         if self.scheme.continuity == "mass":
             divergence = divergence / (1.0 + particles.deviation)  # 2.19 gives the density rate, rho0 = 1
-        crowding = rates.concentration
-        if wall is None or wall.share is None:
-            return divergence, crowding
-        share = wall.share.clamp_min(_SMALLEST_KERNEL_SHARE)
-        swept = ((wall.velocity - particles.velocity) * wall.share_gradient).sum(1)
-        divergence = (divergence - swept) / share
-        if crowding is not None:
-            crowding = crowding - wall.share_gradient
-        return divergence, crowding
+        return completed(divergence, rates.concentration, particles.velocity, wall)
 
     def _new_density(
         self, particles: Particles, rates: Rates, divergence: Tensor, dt: Tensor, filtering: Tensor | None = None
@@ -296,7 +282,7 @@ class Stepper:
             if self.scheme.wall.no_slip and self.coefficients.viscosity is not None:
                 nu = per_particle(self.coefficients.viscosity, particles.member)
                 acceleration = acceleration + friction(nu, particles.velocity, wall)
-            acceleration = acceleration / wall.share.clamp_min(_SMALLEST_KERNEL_SHARE)[:, None]
+            acceleration = acceleration / wall.share.clamp_min(SMALLEST_SHARE)[:, None]
         elif wall is not None and isinstance(self.scheme.wall, PotentialWall):
             sound = per_particle(self.coefficients.sound_speed, particles.member)
             acceleration = acceleration + potential_force(self.scheme.wall, sound, wall)

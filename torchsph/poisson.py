@@ -8,21 +8,24 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-# a preconditioner needs a diagonal: particles without a neighbour keep their pressure
-_TINY = 1e-12
+# below this a diagonal entry belongs to a particle without neighbours, whose equation says nothing
+_ALONE = 1e-12
+_TINY = torch.finfo(torch.float64).tiny
 
 
 @dataclass(frozen=True)
 class PoissonSolution:
-    """Pressure (N,) and how the solver got there, per member.
+    """What the solver found, and how; all but ``values`` per member.
 
     Attributes:
-        iterations: (members,) int64. residual: (members,) relative to the source. converged: (members,) bool.
-        mismatch: (members,) mean of the source, which no pressure can answer where no particle's pressure is given;
-            it has been taken out.
+        values: (N,), 0 on particles that are not free.
+        iterations: (members,) int64. residual: (members,) norm relative to the source's.
+        converged: (members,) bool.
+        mismatch: (members,) mean of the source, taken out where the constant is in the null space: no pressure can
+            answer it (a closed cavity whose volume changes).
     """
 
-    pressure: Tensor
+    values: Tensor
     iterations: Tensor
     residual: Tensor
     converged: Tensor
@@ -31,12 +34,13 @@ class PoissonSolution:
 
 @dataclass(frozen=True)
 class PoissonProblem:
-    """A u = source on the particles that are ``free``; the others hold pressure 0 or take no part.
+    """A u = source on the particles that are ``free``; the others hold 0.
 
     Attributes:
-        apply: A on (N,), symmetric and not negative under the weight. diagonal: (N,) of A.
-        weight: (N,) particle volumes: A is symmetric in the sum over weight a b.
-        free: (N,) bool. singular: (members,) bool: members where A has the constant as null space.
+        apply: A on (N,): symmetric and not negative in the sum over weight a b.
+        diagonal: (N,) of A. weight: (N,), positive, the particles' volumes.
+        free: (N,) bool. singular: (members,) bool, members where A has the constant in its null space.
+        member: (N,) int64. members: their number.
     """
 
     apply: Callable[[Tensor], Tensor]
@@ -48,57 +52,59 @@ class PoissonProblem:
     members: int
 
     def total(self, values: Tensor) -> Tensor:
-        """Sum over each member in double precision, (members,)."""
+        """Sum of (N,) over each member, (members,) float64."""
         out = torch.zeros(self.members, dtype=torch.float64, device=values.device)
         return out.index_add_(0, self.member, values.double())
 
     def spread(self, values: Tensor, like: Tensor) -> Tensor:
-        """(members,) given to every particle, (N,)."""
+        """(members,) given to every particle, (N,) of the type of ``like``."""
         return values.to(like.dtype).index_select(0, self.member)
+
+    def image(self, values: Tensor) -> Tensor:
+        """A ``values`` on free particles, 0 elsewhere."""
+        return torch.where(self.free, self.apply(values), torch.zeros_like(values))
 
 
 def solve(
-    problem: PoissonProblem, source: Tensor, start: Tensor, *, tolerance: float, iterations: int
+    problem: PoissonProblem, source: Tensor, start: Tensor | None, *, tolerance: float, iterations: int
 ) -> PoissonSolution:
-    """Solve by conjugate gradients with the diagonal as preconditioner, each member until its own residual is small.
+    """Conjugate gradients with the diagonal as preconditioner, each member until its own residual is small.
+
+    Sums run in double precision, the rest in that of ``source``. A member that is done, or whose numbers are not
+    finite, is left as it is while the others go on.
 
     Args:
-        source, start: (N,). tolerance: of the residual relative to the source. iterations: at most.
-
-    A member that does not converge keeps what it has and is marked; one with a non-finite residual stops at once.
+        source: (N,). start: (N,) or None for 0. tolerance: of the residual relative to the source.
     """
-    p = problem
-    zero = torch.zeros_like(source)
-    source = torch.where(p.free, source, zero)
+    p, zero = problem, torch.zeros_like(source)
     mass = torch.where(p.free, p.weight, zero)
     mean = p.total(mass * source) / p.total(mass).clamp_min(_TINY)
     mean = torch.where(p.singular, mean, torch.zeros_like(mean))
     source = torch.where(p.free, source - p.spread(mean, source), zero)
-    pressure = torch.where(p.free, start, zero)
-    inverse = torch.where(p.free & (p.diagonal > _TINY), 1.0 / p.diagonal.clamp_min(_TINY), zero)
-    residual = torch.where(p.free, source - p.apply(pressure), zero)
+    inverse = torch.where(p.diagonal > _ALONE, 1.0 / p.diagonal.clamp_min(_ALONE), zero)
+    values, residual = zero, source
+    if start is not None:
+        values = torch.where(p.free, start, zero)
+        residual = source - p.image(values)
     scale = p.total(mass * source * source)
     wanted = tolerance**2 * scale
-    count = torch.zeros(p.members, dtype=torch.int64, device=source.device)
-    direction, old = zero, torch.ones_like(scale)
     left = p.total(mass * residual * residual)
-    active = left > wanted
+    count = torch.zeros(p.members, dtype=torch.int64, device=source.device)
+    active, direction, old = left > wanted, zero, torch.ones_like(left)
     for _ in range(iterations):
         if not bool(active.any()):
             break
         pre = inverse * residual
         new = p.total(mass * residual * pre)
-        beta = torch.where(count > 0, new / old.clamp_min(1e-300), torch.zeros_like(new))
-        direction = pre + p.spread(beta, pre) * direction
-        image = torch.where(p.free, p.apply(direction), zero)
+        beta = torch.where(count > 0, new / old.clamp_min(_TINY), torch.zeros_like(new))
+        direction, old = pre + p.spread(beta, pre) * direction, new
+        image = p.image(direction)
         curvature = p.total(mass * direction * image)
         active = active & (curvature > 0)
-        alpha = torch.where(active, new / curvature.clamp_min(1e-300), torch.zeros_like(new))
-        along = p.spread(alpha, pre)
-        pressure, residual = pressure + along * direction, residual - along * image
-        old = new
-        count += active
+        along = p.spread(torch.where(active, new / curvature.clamp_min(_TINY), torch.zeros_like(new)), pre)
+        values, residual = values + along * direction, residual - along * image
+        count = count + active
         left = p.total(mass * residual * residual)
         active = active & (left > wanted) & torch.isfinite(left)
-    relative = torch.sqrt(left / scale.clamp_min(1e-300))
-    return PoissonSolution(pressure, count, relative, left <= wanted, mean)
+    relative = torch.sqrt(left / scale.clamp_min(_TINY))
+    return PoissonSolution(values, count, relative, left <= wanted, mean)

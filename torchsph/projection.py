@@ -1,110 +1,214 @@
-"""One time step of the incompressible scheme: predict with viscosity, project, move."""
+"""Projecting velocities on divergence-free ones, positions on evenly filled ones; a time step of the former."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from .integrate import Stepper, Surroundings
-from .pairs.interface import MomentumTerms, RateTerms, per_particle
+from .incompressible import Projection
+from .integrate import Surroundings
+from .neighbours import PairSearch
+from .pairs.interface import MomentumTerms, Rates, RateTerms, Support, per_particle
+from .parameters import Coefficients
 from .particles import Particles
 from .poisson import PoissonProblem, PoissonSolution, solve
-from .walls import WallSample, friction
+from .record import Record
+from .smoothing import kernel
+from .terms import shifting_displacement, softened_share
+from .walls import SMALLEST_SHARE, WallSample, completed, friction
 
-class ProjectionStepper(Stepper):
-    def step(self, particles, step, number, around):
-        dt = per_particle(step, particles.member)
-        wall = around.sample(particles)
-        pairs = self.pair_search.at(particles)
-        body = around.body_force(particles)
-        fluid = particles.fluid[:, None]
-        acc = torch.zeros_like(particles.velocity)
-        if self.coefficients.viscosity is not None:
-            lam = MomentumTerms(pressure=None, laminar=self.momentum_terms.laminar, artificial=self.momentum_terms.artificial)
-            acc = self.pair_search.backend.momentum(pairs, self._pressureless(particles), self.support, lam)
-            if wall is not None and self.scheme.wall.no_slip:
-                nu = per_particle(self.coefficients.viscosity, particles.member)
-                acc = acc + friction(nu, particles.velocity, wall)
-            if wall is not None:
-                acc = acc / wall.share.clamp_min(.1)[:, None]
-        if body is not None: acc = acc + body
-        particles = particles.changed(velocity=torch.where(fluid, particles.velocity + dt[:, None]*acc, particles.velocity))
-        start = particles.pressure if particles.pressure is not None else torch.zeros_like(particles.mass)
-        velocity, solution, crowding = self.project(particles, pairs, wall, start*dt if False else start, self.tol)
-        particles = particles.changed(velocity=velocity, pressure=solution.pressure)
-        self.iters.append(solution.iterations.max().item())
-        class R: xsph=None
-        drift = dt[:, None]*velocity + self.wandering(particles, R, crowding, step, particles)
-        if self.every and (self.count % self.every) == 0:
-            move, _, sol = packing(self, particles, pairs, wall, iterations=10)
-            drift = drift + self.frac*move
-        self.count += 1
-        return particles.changed(position=particles.position + drift), acc, wall
-
-    tol = 1e-2
-    tau = None
-    every = 0
-    frac = .5
-    count = 0
-    iters: list = []
-
-    def project(self, particles, pairs, wall, start, tolerance):
-        backend = self.pair_search.backend
-        state = self._pressureless(particles)
-        rates = backend.rates(pairs, state, self.support, RateTerms(continuity="volume", concentration=True, shepard=self.tau is not None))
-        divergence, crowding = self._complete(particles, rates, wall)
-        share = wall.share.clamp_min(.1) if wall is not None else torch.ones_like(divergence)
-        if self.tau is not None:
-            n = rates.shepard_volume/share
-            divergence = divergence - (n-1).clamp(-.3,.3)/self.tau
-        fluid = particles.fluid
-        apply = lambda f: backend.laplacian(pairs, state, self.support, f, fluid)[0]
-        _, diagonal = backend.laplacian(pairs, state, self.support, start, fluid)
-        problem = PoissonProblem(apply, diagonal, particles.mass, fluid,
-            torch.ones(particles.members, dtype=torch.bool), particles.member, particles.members)
-        sol = solve(problem, -divergence*share, start, tolerance=tolerance, iterations=200)
-        phi = ProjectionStepper._extended(self, particles, pairs, sol.pressure)
-        form = getattr(self.scheme, "projection_form", "difference")
-        grad = backend.momentum(pairs, particles.state(phi), self.support, MomentumTerms(pressure="difference"))
-        grad = grad/share[:, None]
-        return torch.where(fluid[:, None], particles.velocity + grad, particles.velocity), sol, crowding
-
-    def start(self, *a):
-        class T: pass
-        t, self.tau = ProjectionStepper.tau, None
-        out = ProjectionStepper.project(self,*a); self.tau=t
-        return out
-
-    def _extended(self, particles, pairs, pressure):
-        fluid = particles.fluid
-        if bool(fluid.all()): return pressure
-        backend = self.pair_search.backend
-        one = torch.where(fluid, particles.mass, torch.zeros_like(pressure))
-        def sums(mass):
-            st = particles.changed(mass=mass).state(pressure)
-            return backend.rates(pairs, st, self.support, RateTerms(continuity=None, shepard=True)).shepard_mass
-        w = sums(one); wp = sums(one*pressure)
-        return torch.where(fluid, pressure, wp/w.clamp_min(1e-6))
+# densities that a source can react to: what is denser or thinner by more is a fault of another kind
+_LARGEST_EXCESS = 0.3
+# a displacement of more than this (spacings) would outrun the linearisation
+_LARGEST_MOVE = 0.2
 
 
-def packing(self, particles, pairs, wall, tolerance=3e-2, iterations=30):
-    """Displacement (N, D) that evens out the number density, by one linearised projection."""
-    backend = self.pair_search.backend
-    state = self._pressureless(particles)
-    share = wall.share.clamp_min(.1)
-    rates = backend.rates(pairs, state, self.support, RateTerms(continuity=None, shepard=True))
-    fluid = particles.fluid
-    n = rates.shepard_volume/share
-    apply = lambda f: backend.laplacian(pairs, state, self.support, f, fluid)[0]
-    zero = torch.zeros_like(n)
-    _, diagonal = backend.laplacian(pairs, state, self.support, zero, fluid)
-    problem = PoissonProblem(apply, diagonal, particles.mass, fluid,
-        torch.ones(particles.members, dtype=torch.bool), particles.member, particles.members)
-    sol = solve(problem, (n-1).clamp(-.3,.3)*share, zero, tolerance=tolerance, iterations=iterations)
-    phi = self._extended(particles, pairs, sol.pressure) if hasattr(self, "_extended") else ProjectionStepper._extended(self, particles, pairs, sol.pressure)
-    move = backend.momentum(pairs, particles.state(phi), self.support, MomentumTerms(pressure="difference"))/share[:, None]
-    move = torch.where(fluid[:, None], move, torch.zeros_like(move))
+@dataclass(frozen=True)
+class Neighbourhood:
+    """Particles with their neighbours, kernel and walls, at one moment."""
+
+    particles: Particles
+    search: PairSearch
+    pairs: Any
+    support: Support
+    wall: WallSample | None
+
+    @property
+    def share(self) -> Tensor | float:
+        """Part of each kernel inside the walls, (N,)."""
+        return 1.0 if self.wall is None else self.wall.share.clamp_min(SMALLEST_SHARE)
+
+    def rates(self, terms: RateTerms) -> Rates:
+        """First-pass sums."""
+        return self.search.backend.rates(self.pairs, self.particles.state(self.particles.deviation), self.support, terms)
+
+    def excess(self, sums: Rates) -> Tensor:
+        """Number density over the rest density, less 1: (N,), from Shepard's sum."""
+        return (sums.shepard_volume / self.share - 1.0).clamp(-_LARGEST_EXCESS, _LARGEST_EXCESS)
+
+    def push(
+        self, source: Tensor, start: Tensor | None, surface: Tensor | None, tolerance: float, iterations: int
+    ) -> tuple[Tensor, PoissonSolution]:
+        """Solve -laplacian(u) = ``source`` (N,); minus the gradient of u (N, D), 0 in reservoirs, and the solution.
+
+        Walls and buffers are impermeable to u (Neumann); where ``surface`` (N,) bool u is 0.
+        """
+        p, backend = self.particles, self.search.backend
+        state, fluid = p.state(p.deviation), p.fluid
+        diagonal = backend.laplacian(self.pairs, state, self.support, torch.zeros_like(source), fluid)[1]
+        free, singular = fluid, torch.ones(p.members, dtype=torch.bool, device=fluid.device)
+        if surface is not None:
+            free = fluid & ~surface
+            singular = p.per_member(surface.to(torch.int64), "sum") == 0
+        problem = PoissonProblem(
+            lambda u: backend.laplacian(self.pairs, state, self.support, u, fluid)[0], diagonal, p.mass, free, singular,
+            p.member, p.members,
+        )
+        found = solve(problem, source * self.share, start, tolerance=tolerance, iterations=iterations)
+        terms = MomentumTerms(pressure="difference")
+        slope = backend.momentum(self.pairs, p.state(self._continued(found.values)), self.support, terms)
+        slope = slope / self.share[:, None] if self.wall is not None else slope
+        return torch.where(fluid[:, None], slope, torch.zeros_like(slope)), found
+
+    def _continued(self, values: Tensor) -> Tensor:
+        """Values of the fluid, and in buffers the mean of the fluid around: (N,)."""
+        fluid = self.particles.fluid
+        if bool(fluid.all()):
+            return values
+        part = torch.where(fluid, self.particles.mass, torch.zeros_like(values))
+
+        def around(mass: Tensor) -> Tensor:
+            state = self.particles.changed(mass=mass).state(values)
+            terms = RateTerms(continuity=None, shepard=True)
+            return self.search.backend.rates(self.pairs, state, self.support, terms).shepard_mass
+
+        weight = around(part)
+        mean = around(part * values) / weight.clamp_min(torch.finfo(weight.dtype).tiny)
+        return torch.where(fluid, values, torch.where(weight > 0, mean, torch.zeros_like(mean)))
+
+
+def divergence_free(
+    around: Neighbourhood, *, times: int = 1, tolerance: float = 1e-3, iterations: int = 200
+) -> tuple[Tensor, PoissonSolution]:
+    """Velocities (N, D) of the fluid nearest to the present ones without divergence, after ``times`` projections.
+
+    The projection is approximate (Cummins & Rudman 1999 section 3): the operator solved is not the divergence of the
+    gradient, so a second one takes away much of what the first has left.
+    """
+    particles = around.particles
+    for _ in range(times):
+        now = Neighbourhood(particles, around.search, around.pairs, around.support, around.wall)
+        divergence, _ = completed(now.rates(RateTerms()).divergence, None, particles.velocity, around.wall)
+        push, found = now.push(-divergence, None, None, tolerance, iterations)
+        particles = particles.changed(velocity=particles.velocity + push)
+    return particles.velocity, found
+
+
+def packing(around: Neighbourhood, *, tolerance: float = 3e-2, iterations: int = 30) -> tuple[Tensor, Tensor]:
+    """Displacements (N, D) of the fluid that even out its number density to first order, and its excess (N,) before.
+
+    The displacement is minus the gradient of a potential whose Laplacian is the excess: one Newton step towards a
+    packing that shifting would take hundreds of sweeps to reach.
+    """
+    excess = around.excess(around.rates(RateTerms(continuity=None, shepard=True)))
+    move, _ = around.push(excess, None, None, tolerance, iterations)
     length = move.norm(dim=1, keepdim=True)
-    return move*(0.2/length.clamp_min(.2)), n, sol
+    return move * (_LARGEST_MOVE / length.clamp_min(_LARGEST_MOVE)), excess
+
+
+class ProjectionStepper:
+    """Steps particles with the incompressible scheme; holds the neighbour list, coefficients and the accounts."""
+
+    def __init__(
+        self, scheme: Projection, coefficients: Coefficients, search: PairSearch, dimension: int, record: Record
+    ) -> None:
+        self.scheme, self.pair_search, self.dimension, self._record = scheme, search, dimension, record
+        self.use(coefficients)
+
+    def use(self, coefficients: Coefficients) -> None:
+        """Step with these coefficients from now on."""
+        self.coefficients = coefficients
+        self.support = Support(kernel(self.scheme.kernel), coefficients.smoothing_length, self.dimension)
+        self._laminar = None
+        if coefficients.viscosity is not None:
+            acting = coefficients.viscosity / softened_share(self.support.kernel, self.dimension)
+            self._laminar = MomentumTerms(pressure=None, laminar=acting)
+        self._terms = RateTerms(
+            concentration=coefficients.shifting is not None,
+            shepard=self.scheme.relaxation is not None or self.scheme.surface is not None,
+        )
+
+    def step(
+        self, particles: Particles, step: Tensor, number: Tensor, around: Surroundings
+    ) -> tuple[Particles, Tensor, WallSample | None]:
+        """Advance every member by its own ``step`` (members,), internal time.
+
+        Friction and body forces first, then the projection, then the motion with the projected velocity. Returns the
+        particles, their acceleration (N, D) and the walls that they saw.
+        """
+        dt = per_particle(step, particles.member)
+        wall, before = around.sample(particles), particles.velocity
+        pairs = self.pair_search.at(particles)
+        force = self._without_pressure(particles, pairs, wall, around)
+        if force is not None:
+            moved = before + dt[:, None] * force
+            particles = particles.changed(velocity=torch.where(particles.fluid[:, None], moved, before))
+        here = Neighbourhood(particles, self.pair_search, pairs, self.support, wall)
+        sums = here.rates(self._terms)
+        divergence, crowding = completed(sums.divergence, sums.concentration, particles.velocity, wall)
+        surface = None if self.scheme.surface is None else sums.shepard_volume / here.share < self.scheme.surface
+        source = -divergence
+        if self.scheme.relaxation is not None:
+            excess = here.excess(sums)
+            source = source + (excess if surface is None else excess.clamp_min(0.0)) / self.scheme.relaxation
+        push, found = here.push(source, self._guess(particles, dt), surface, self.scheme.tolerance, self.scheme.iterations)
+        self._account(found, step)
+        velocity = particles.velocity + push
+        held = per_particle(torch.where(found.converged, step, torch.zeros_like(step)), particles.member)
+        pressure = found.values / torch.where(held > 0, held, torch.ones_like(held)) * (held > 0)
+        particles = particles.changed(velocity=velocity, pressure=pressure)
+        drift = dt[:, None] * velocity
+        if crowding is not None:
+            drift = drift + self._shifted(particles, crowding, step)
+        waiting = torch.where(dt > 0, 1.0 / dt.clamp_min(torch.finfo(dt.dtype).tiny), torch.zeros_like(dt))
+        acceleration = (velocity - before) * waiting[:, None]
+        return particles.changed(position=particles.position + drift), acceleration, wall
+
+    def _without_pressure(
+        self, particles: Particles, pairs: Any, wall: WallSample | None, around: Surroundings
+    ) -> Tensor | None:
+        """Acceleration (N, D) by friction and body forces, or None without either."""
+        total = around.body_force(particles)
+        if self._laminar is None:
+            return total
+        state = particles.state(particles.deviation)
+        drag = self.pair_search.backend.momentum(pairs, state, self.support, self._laminar)
+        if wall is not None:
+            if self.scheme.wall.no_slip:
+                nu = per_particle(self.coefficients.viscosity, particles.member)
+                drag = drag + friction(nu, particles.velocity, wall)
+            drag = drag / wall.share.clamp_min(SMALLEST_SHARE)[:, None]
+        return drag if total is None else total + drag
+
+    @staticmethod
+    def _guess(particles: Particles, dt: Tensor) -> Tensor | None:
+        """The last step's pressure times this step; None before the first (half the iterations of a start from 0)."""
+        return None if particles.pressure is None else particles.pressure * dt
+
+    def _shifted(self, particles: Particles, crowding: Tensor, step: Tensor) -> Tensor:
+        shift = shifting_displacement(
+            particles, crowding, step, self.coefficients.smoothing_length, self.coefficients.shifting,
+            self.scheme.shifting_speed == "largest", self.scheme.shifting_surface,
+        )
+        return torch.where(particles.fluid[:, None], shift, torch.zeros_like(shift))
+
+    def _account(self, found: PoissonSolution, step: Tensor) -> None:
+        """Note iterations, failures and sources that no pressure answers, of the members that step."""
+        record, steps = self._record, step > 0
+        record.pressure_iterations += torch.where(steps, found.iterations, torch.zeros_like(found.iterations))
+        record.unconverged += steps & ~found.converged
+        mismatch = torch.where(steps, found.mismatch.abs(), torch.zeros_like(found.mismatch))
+        record.largest_mismatch = torch.maximum(record.largest_mismatch, mismatch)

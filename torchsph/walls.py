@@ -17,6 +17,8 @@ from .schemes import PotentialWall
 # faster than the viscous time step resolves. Many stand within 0.3 of the wall: 0.3 here lets a pipe flow slip by 0.5 %
 _SMALLEST_FRICTION_DISTANCE = 0.15
 
+# a particle whose kernel lies almost wholly behind walls would divide by nothing
+SMALLEST_SHARE = 0.1
 
 @dataclass(frozen=True)
 class WallSample:
@@ -72,6 +74,21 @@ def wall_pressure_force(form: str, pressure: Tensor, deviation: Tensor, wall: Wa
     """
     own = {"symmetric": pressure, "sum": pressure, "switched": pressure.abs(), "difference": -pressure}[form]
     return ((pressure + own) / (1.0 + deviation))[:, None] * wall.share_gradient
+
+
+def completed(
+    divergence: Tensor, crowding: Tensor | None, velocity: Tensor, wall: WallSample | None
+) -> tuple[Tensor, Tensor | None]:
+    """Velocity divergence (N,) and crowding gradient (N, D) with the part of the kernel behind the wall added.
+
+    Ferrand et al. 2013 eqs. 20-22 with the wall's velocity: the sums are divided by the share of the kernel inside the
+    fluid, and the wall contributes its surface integral.
+    """
+    if wall is None or wall.share is None:
+        return divergence, crowding
+    swept = ((wall.velocity - velocity) * wall.share_gradient).sum(1)
+    divergence = (divergence - swept) / wall.share.clamp_min(SMALLEST_SHARE)
+    return divergence, None if crowding is None else crowding - wall.share_gradient
 
 
 def friction(viscosity: float | Tensor, velocity: Tensor, wall: WallSample) -> Tensor:
