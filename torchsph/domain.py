@@ -51,7 +51,8 @@ class Domain:
             complete = isinstance(scheme.wall, CompleteKernelWall)
             self._check_periodic_walls()
             self.walls = WallFields(
-                scene.walls, units.length, units.speed, smoothing, scheme.smoothing_ratio, complete, device, dtype
+                scene.walls, units.length, units.speed, smoothing, scheme.smoothing_ratio, complete, device, dtype,
+                sliding=complete and scheme.wall.sliding,
             )
             self._make_valves()
 

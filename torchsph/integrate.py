@@ -244,7 +244,10 @@ class Stepper:
         if wall is None or wall.share is None:
             return divergence, crowding
         share = wall.share.clamp_min(_SMALLEST_KERNEL_SHARE)
-        swept = ((wall.velocity - particles.velocity) * wall.share_gradient).sum(1)
+        if wall.swept is None:
+            swept = ((wall.velocity - particles.velocity) * wall.share_gradient).sum(1)
+        else:
+            swept = wall.swept - (particles.velocity * wall.share_gradient).sum(1)
         divergence = (divergence - swept) / share
         if crowding is not None:
             crowding = crowding - wall.share_gradient
@@ -264,6 +267,9 @@ class Stepper:
             c = self.coefficients
             spread = per_particle(c.diffusion * c.smoothing_length * c.sound_speed, particles.member)
             rate = rate + spread * rates.diffusion
+        if self.scheme.constant_volume:
+            mean = particles.per_member(rate, "sum") / particles.per_member(torch.ones_like(rate), "sum").clamp_min(1.0)
+            rate = rate - per_particle(mean, particles.member)
         return rate
 
     def pressure(self, particles: Particles, divergence: Tensor | None = None) -> Tensor:
