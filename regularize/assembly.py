@@ -4,11 +4,15 @@ Every row lives in one knot cell and touches only that cell's coefficients, so a
 dense block instead of one sparse product per row.
 """
 
+from math import prod
+from mmap import mmap
+
 import torch
 
 from .operators import CellRows, RowBlock, System, VectorRows
 from .ordering import Ordering
 
+LAZY = 1 << 24  # bytes from which on a band is mapped page by page
 CELLS_PER_PASS = 64  # bounds the dense blocks (cells, L C, L C) of a pass to about 20 MB for cubic 3-D
 
 
@@ -20,7 +24,12 @@ def empty_band(system: System, ordering: Ordering) -> torch.Tensor:
     """
     c = system.components
     shape = (len(ordering.nodes) * c, (ordering.half_bandwidth + 1) * c)
-    band = torch.zeros(shape, dtype=torch.float64, device=ordering.nodes.device)
+    device = ordering.nodes.device
+    if device.type == "cpu" and prod(shape) * 8 > LAZY:
+        # pages of zeros that nothing ever touches, beyond the envelope, then take no memory
+        band = torch.frombuffer(mmap(-1, prod(shape) * 8), dtype=torch.float64).view(shape)
+    else:
+        band = torch.zeros(shape, dtype=torch.float64, device=device)
     band[:, 0] = system.damping**2
     return band
 

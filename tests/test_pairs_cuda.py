@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import sys
+import types
 
 import pytest
 import torch
@@ -123,3 +125,13 @@ def test_missing_device_is_explained():
             ValueError, match="'cuda' was asked for and cannot be used: torch finds no CUDA device"
         ):
             backend("cuda", "cuda")
+
+
+def test_triton_that_is_too_old_is_explained(monkeypatch):
+    """Kernels that hold tuples need 3.3; an older one would fail in the middle of a run."""
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "get_device_name", lambda: "some card")
+    for version, present in (("3.2.0", False), ("3.3.1", True), ("3.10.0+git1", True), ("4.0", True)):
+        monkeypatch.setitem(sys.modules, "triton", types.SimpleNamespace(__version__=version))
+        status = next(s for s in available_backends("cuda") if s.name == "cuda")
+        assert status.present == present and version in status.reason

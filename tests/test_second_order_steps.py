@@ -52,11 +52,11 @@ def test_order_of_the_steps(order, viscosity, expected):
 
 def test_options_that_would_be_ignored_are_refused():
     with pytest.raises(ValueError, match="tensile must be positive and needs pressure='symmetric'"):
-        preset("default", tensile=0.2)
+        preset("weakly_compressible", tensile=0.2)
     with pytest.raises(ValueError, match="belongs to order 'thesis', got order 'verlet'"):
-        preset("default", xsph=XSPH(0.2, "velocity"), order="verlet")
+        preset("weakly_compressible", xsph=XSPH(0.2, "velocity"), order="verlet")
     with pytest.raises(ValueError, match="Shepard filter needs order"):
-        preset("default", shepard_period=20, order="verlet")
+        preset("weakly_compressible", shepard_period=20, order="verlet")
 
 
 def test_the_softening_of_the_viscous_term_is_compensated():

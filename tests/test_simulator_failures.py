@@ -25,7 +25,7 @@ def vortices(speeds, dtype=torch.float64, backend="auto", **changes):
     particles = Particles(position, velocity, 0 * one, one, label, label, 1).repeated(len(speeds))
     factor = torch.tensor(speeds, dtype=dtype)[particles.member]
     particles = particles.changed(velocity=particles.velocity * factor[:, None])
-    scheme = preset("default", **({"sound_speed": 10.0} | changes))
+    scheme = preset("weakly_compressible", **({"sound_speed": 10.0} | changes))
     return Simulator(SCENE, scheme, dtype=dtype, backend=backend).resume(particles, 0.0)
 
 

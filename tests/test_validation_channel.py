@@ -25,7 +25,7 @@ def channel_error(flow, across, times, **changes):
         spacing=spacing, fluid=Fluid(1.0, VISCOSITY), walls=walls, period=(length, None), gravity=(force, 0.0),
         dimension=2,
     )  # fmt: skip
-    scheme = preset("default", **(validation.CHANNEL_OPTIONS | changes))
+    scheme = preset("weakly_compressible", **(validation.CHANNEL_OPTIONS | changes))
     run = Simulator(scene, scheme, seeding=Seeding(jitter=0.0)).start(0.0)
     errors = []
     for time in times:

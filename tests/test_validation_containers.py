@@ -27,7 +27,7 @@ def settled(name, across, time, **changes):
         spacing=1 / across, fluid=Fluid(1.0, 0.05), walls=geometry.WallMotion.at_rest(surface),
         gravity=(0.0, 0.0, -GRAVITY),
     )  # fmt: skip
-    scheme = preset("default", **({"sound_speed": 10.0} | changes))
+    scheme = preset("weakly_compressible", **({"sound_speed": 10.0} | changes))
     run = Simulator(scene, scheme).start(0.0)
     run.advance(time)
     p = run.particles

@@ -21,7 +21,7 @@ def collapse(spacing, viscosity, *, dtype=torch.float32, backend="auto", **chang
     """(front error against each experiment, front relative to Martin & Moyce's, energy over time, record)"""
     scene = column_scene(spacing, viscosity=viscosity)
     options = FREE_SURFACE_OPTIONS | {"sound_speed": 5.0 * scene.reference_speed} | changes
-    simulator = Simulator(scene, preset("default", **options), dtype=dtype, backend=backend)
+    simulator = Simulator(scene, preset("weakly_compressible", **options), dtype=dtype, backend=backend)
     run = simulator.resume(resting_block(simulator, (0.0, 0.0), (1.0, 2.0)), 0.0)
     time, front, energy = np.arange(0.1, 3.15, 0.1), [], []
     for t in time:

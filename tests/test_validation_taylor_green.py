@@ -7,79 +7,87 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from torchsph import Scene, Seeding, Simulator, preset, validation
-from torchsph.scene import Fluid
+from torchsph import preset, validation
+from torchsph.validation_runs import kinetic_energy, taylor_green, taylor_green_error
 
-VISCOSITY = 0.01  # Re 100 with U = L = 1
-DECAY_TIME = 1 / (8 * math.pi**2 * VISCOSITY)
+DECAY_TIME = 100 / (8 * math.pi**2)  # at Re 100
 EXPERIMENTS = Path(__file__).resolve().parents[2] / "shared" / "data" / "experiments"
 
 
-def vortex(resolution, duration, **changes):
-    """Relative L2 velocity error after ``duration`` with the options for periodic flows."""
-    scene = Scene(spacing=1 / resolution, fluid=Fluid(1.0, VISCOSITY), period=(1.0, 1.0), dimension=2)
-    scheme = preset("default", **(validation.PERIODIC_OPTIONS | changes))
-    run = Simulator(scene, scheme, seeding=Seeding(jitter=0.0)).start(0.0)
-    points = run.particles.position * scene.spacing
-    pressure = validation.taylor_green_2d_pressure(points, 0.0, VISCOSITY)
-    run.particles = run.particles.changed(
-        velocity=validation.taylor_green_2d(points, 0.0, VISCOSITY), deviation=pressure / scheme.sound_speed**2
-    )
+def plane_error(resolution, duration, **changes):
+    """Relative L2 velocity error at Re 100 after ``duration`` with the options for periodic flows."""
+    run = taylor_green(resolution, scheme=preset("weakly_compressible", **(validation.PERIODIC_OPTIONS | changes)))
     run.advance(duration)
     assert not bool(run.record.failed.any())
-    points = run.particles.position.double() * scene.spacing
-    exact = validation.taylor_green_2d(points, duration, VISCOSITY)
-    return float((run.particles.velocity.double() - exact).norm() / exact.norm())
+    return taylor_green_error(run)
 
 
 def test_taylor_green_2d_after_one_decay_time():
-    """L2 error at Re 100 within 7 % at 25^2 and 3.2 % at 50^2 (measured 5.7 and 2.7 %); 100^2 is the slow test."""
-    errors = [vortex(n, DECAY_TIME) for n in (25, 50)]
-    assert errors[0] < 0.07 and errors[1] < 0.032
-    assert validation.observed_order([1 / 25, 1 / 50], errors) > 0.9
+    """L2 error at Re 100 within 3 % at 25^2 and 1 % at 50^2 (measured 2.6 and 0.88 %); 100^2 is the slow test."""
+    errors = [plane_error(n, DECAY_TIME) for n in (25, 50)]
+    assert errors[0] < 0.03 and errors[1] < 0.01
+    assert validation.observed_order([1 / 25, 1 / 50], errors) > 1.4
 
 
 @pytest.mark.slow
 def test_taylor_green_2d_at_100():
-    """L2 error within 1 % at 100^2 and order 1.5 over 25^2 to 100^2 (measured 0.66 % and 1.55).
-
-    The errors are not on one line (5.7, 2.7, 0.66 %): at 50^2 the lattice still breaks up a little.
-    """
-    errors = [vortex(n, DECAY_TIME) for n in (25, 50, 100)]
-    assert errors[2] < 0.01
-    assert validation.observed_order([1 / 25, 1 / 50, 1 / 100], errors) > 1.4
+    """L2 error within 0.3 % at 100^2 and order 1.5 over 25^2 to 100^2 (measured 0.27 % and 1.62)."""
+    errors = [plane_error(n, DECAY_TIME) for n in (25, 50, 100)]
+    assert errors[2] < 0.003
+    assert validation.observed_order([1 / 25, 1 / 50, 1 / 100], errors) > 1.5
 
 
-def test_the_speed_of_the_shifting_matters_at_stagnation_points():
-    """With the particle's own speed the lattice breaks up where the fluid rests: over three times the error."""
-    assert vortex(25, 0.5, shifting_speed="local", shifting=0.5) > 3 * vortex(25, 0.5)
+def test_shifting_by_the_largest_speed_is_what_keeps_particles_even():
+    """With the particle's own speed the lattice breaks up where the fluid rests; the default's strength is far less."""
+    even = plane_error(25, 0.5)
+    assert plane_error(25, DECAY_TIME, shifting_speed="local") > 1.3 * plane_error(25, DECAY_TIME)
+    assert plane_error(25, 0.5, shifting_speed="local", shifting=0.5) > 7 * even
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("reynolds", "bound"), [(50, 0.09), (100, 0.09)])
-def test_taylor_green_3d_kinetic_energy(reynolds, bound):
-    """Kinetic energy until t = 5 against JAX-Fluids on 64^3 cells, at 32^3 particles, relative to its present value.
+def energy_table(reynolds):
+    """Rows (time, kinetic energy) of JAX-Fluids on 64^3 cells.
 
-    The issue asks for 3 %; at Re 100 the largest error measured at 32^3 is 7.7 % (too dissipative, at t = 5).
+    A pseudo-spectral solution on 48^3 modes, made once for this purpose, agrees with them within 0.3 % until t = 5.
     """
     file = EXPERIMENTS / f"tgv3d_Re{reynolds}.csv"
     if not file.exists():
         pytest.skip(f"{file} is not here")
     rows = [row for row in csv.reader(file.open()) if row and not row[0].startswith("#")]
-    table = np.array(rows[1:], float)
-    side = 2 * math.pi
-    scene = Scene(spacing=side / 32, fluid=Fluid(1.0, 1 / reynolds), period=(side,) * 3)
-    scheme = preset("default", **(validation.PERIODIC_OPTIONS | {"smoothing_ratio": 1.6}))
-    run = Simulator(scene, scheme, seeding=Seeding(jitter=0.0)).start(0.0)
-    points = run.particles.position * scene.spacing
-    pressure = validation.taylor_green_3d_pressure(points)
-    run.particles = run.particles.changed(
-        velocity=validation.taylor_green_3d(points), deviation=pressure / scheme.sound_speed**2
-    )
+    return np.array(rows[1:], float)[:, [0, 2]]
+
+
+def worst_energy(resolution, reynolds, **changes):
+    """Largest deviation of the kinetic energy from the table, relative to its present value, until t = 5."""
+    time, energy = energy_table(reynolds).T
+    scheme = preset("weakly_compressible", **(validation.PERIODIC_OPTIONS_3D | changes))
+    run = taylor_green(resolution, reynolds, dimension=3, scheme=scheme)
     worst = 0.0
-    for time in (1.0, 2.0, 3.0, 4.0, 5.0):
-        run.advance(time)
-        energy = float(run.particles.velocity.double().square().sum(1).mean()) / 2
-        expected = np.interp(time, table[:, 0], table[:, 2])
-        worst = max(worst, abs(energy / expected - 1))
-    assert worst < bound
+    for until in (1.0, 2.0, 3.0, 4.0, 5.0):
+        run.advance(until)
+        worst = max(worst, abs(kinetic_energy(run) / np.interp(until, time, energy) - 1))
+    assert not bool(run.record.failed.any())
+    return worst
+
+
+def test_taylor_green_3d_kinetic_energy():
+    """Within the 3 % that the issue asks for, at Re 100 on 20^3 particles already: measured 1.6 %."""
+    assert worst_energy(20, 100) < 0.025
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("reynolds", [50, 100])
+def test_taylor_green_3d_kinetic_energy_at_32(reynolds):
+    """Within 1.5 %: measured 0.9 and 1.3 % (Re 50 and 100)."""
+    assert worst_energy(32, reynolds) < 0.015
+
+
+@pytest.mark.slow
+def test_disorder_is_what_dissipates_in_space():
+    """Without shifting a third of the energy is lost too early; without damping and diffusion of sound nothing changes.
+
+    Measured at 24^3 with h = 1.6: 34 % without shifting, 10.4 and 10.4 % at strength 8 with bulk damping off or on.
+    """
+    weak = {"smoothing_ratio": 1.6, "shifting": 8.0}
+    assert worst_energy(24, 100, smoothing_ratio=1.6, shifting=None) > 0.25
+    damped, undamped = worst_energy(24, 100, **weak), worst_energy(24, 100, **weak, bulk_damping=None)
+    assert abs(damped - undamped) < 0.01

@@ -10,7 +10,7 @@ import geometry
 from torchsph import Scene, Simulator, preset
 
 SPACING = 1e-3
-SOUND = preset("default").sound_speed
+SOUND = preset("weakly_compressible").sound_speed
 FAST = 0.3 * SOUND
 WAY = 3e-3
 

@@ -22,7 +22,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code (argparse itself leaves with 2 by `SystemExit`)."""
     from torchsph.arguments import build_parser
     from torchsph.commands import COMMANDS
-    from torchsph.schemes import PRESETS
+    from torchsph.presets import PRESETS
 
     args = build_parser(COMMANDS, tuple(PRESETS)).parse_args(arguments)
     try:

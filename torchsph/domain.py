@@ -10,9 +10,10 @@ from geometry import Grid
 from .lookup import LookUp
 from .pairs.interface import per_particle
 from .particles import Particles
+from .presets import Scheme
 from .record import Record
 from .scene import Scene
-from .schemes import CompleteKernelWall, PressureSource, Reservoir, WeaklyCompressible
+from .schemes import CompleteKernelWall, PressureSource, Reservoir
 from .smoothing import kernel
 from .transfer import fill_beyond
 from .units import Units
@@ -30,7 +31,7 @@ class Domain:
     """
 
     def __init__(
-        self, scene: Scene, scheme: WeaklyCompressible, units: Units, device: str, dtype: torch.dtype
+        self, scene: Scene, scheme: Scheme, units: Units, device: str, dtype: torch.dtype
     ) -> None:
         self.scene, self.scheme, self.units = scene, scheme, units
         self.device, self.dtype = device, dtype
@@ -51,7 +52,8 @@ class Domain:
             complete = isinstance(scheme.wall, CompleteKernelWall)
             self._check_periodic_walls()
             self.walls = WallFields(
-                scene.walls, units.length, units.speed, smoothing, scheme.smoothing_ratio, complete, device, dtype
+                scene.walls, units.length, units.speed, smoothing, scheme.smoothing_ratio, complete, device, dtype,
+                sliding=complete and scheme.wall.sliding,
             )
             self._make_valves()
 

@@ -29,13 +29,18 @@ class Transfer:
         fade: time (s) over which the correction below fades, or None for the plain fetch. Imposing and fetching
             loses detail that the particles cannot carry; the forecast is the fetched field plus that loss (initial
             grid minus the field fetched at once), times exp(-lead / fade). For noisy input use None: the loss is noise.
+        projections: how often the imposed velocities are projected on fields without divergence before the first step;
+            needs complete-kernel walls, and is left out with others.
     """
 
     fade: float | None = 0.015
+    projections: int = 2
 
     def __post_init__(self) -> None:
         if self.fade is not None and not self.fade > 0:
             raise ValueError(f"Transfer.fade must be positive (s) or None, got {self.fade}")
+        if self.projections < 0:
+            raise ValueError(f"Transfer.projections must not be negative, got {self.projections}")
 
 
 class GridForecast:
@@ -54,6 +59,8 @@ class GridForecast:
         self.grid, self.transfer, self.start_time = grid, transfer, time
         self.run: Simulation = model.start(time, members=batched.shape[0], seed=seed)
         self.run.impose(grid, batched, mask)
+        if transfer.projections and self.run.can_project:
+            self.run.project(transfer.projections)
         self._lost: Tensor | None = None
         if transfer.fade is not None:
             kept = self.run.fetch(grid, mask)

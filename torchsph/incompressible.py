@@ -36,7 +36,7 @@ class Projection:
     shifting_surface: float | None = None
     relaxation: float | None = 2.0
     surface: float | None = None
-    tolerance: float = 1e-2
+    tolerance: float = 2e-2
     iterations: int = 200
     wall: CompleteKernelWall = field(default_factory=CompleteKernelWall)
     valve: Reservoir | None = field(default_factory=lambda: Reservoir(run_out=3.0))

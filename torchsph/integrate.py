@@ -21,7 +21,6 @@ from .transfer import solve_small
 from .walls import SMALLEST_SHARE, WallSample, completed, friction, potential_force, retardation, wall_pressure_force
 
 
-
 class Surroundings(Protocol):
     """What a step asks about the world around the particles; times are those of the current step."""
 
@@ -250,6 +249,9 @@ class Stepper:
             c = self.coefficients
             spread = per_particle(c.diffusion * c.smoothing_length * c.sound_speed, particles.member)
             rate = rate + spread * rates.diffusion
+        if self.scheme.constant_volume:
+            mean = particles.per_member(rate, "sum") / particles.per_member(torch.ones_like(rate), "sum").clamp_min(1.0)
+            rate = rate - per_particle(mean, particles.member)
         return rate
 
     def pressure(self, particles: Particles, divergence: Tensor | None = None) -> Tensor:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, fields, replace
 import torch
 from torch import Tensor
 
+from .incompressible import Projection
 from .scene import Fluid
 from .schemes import GammaRamp, WeaklyCompressible
 from .units import Units
@@ -21,14 +22,15 @@ class Parameters:
     """Numbers of a run; each is a float for all members, or a tensor (members,) with one for each.
 
     Attributes:
-        sound_speed: m/s. gamma: exponent of the Tait equation. smoothing_ratio: h over the particle spacing.
+        sound_speed: m/s. gamma: exponent of the Tait equation; both None in an incompressible scheme.
+        smoothing_ratio: h over the particle spacing.
         courant, background_pressure, artificial_viscosity, density_diffusion, shifting, bulk_damping: as in
             ``WeaklyCompressible``.
         xsph: epsilon of the scheme's XSPH. viscosity: dynamic, Pa s.
     """
 
-    sound_speed: float | Tensor
-    gamma: float | Tensor
+    sound_speed: float | Tensor | None
+    gamma: float | Tensor | None
     smoothing_ratio: float | Tensor
     courant: float | Tensor
     background_pressure: float | Tensor | None = None
@@ -40,7 +42,7 @@ class Parameters:
     viscosity: float | Tensor | None = None
 
     @classmethod
-    def of(cls, scheme: WeaklyCompressible, fluid: Fluid) -> Parameters:
+    def of(cls, scheme: WeaklyCompressible | Projection, fluid: Fluid) -> Parameters:
         """What a scheme and a fluid say."""
         given = {f.name: getattr(scheme, f.name) for f in fields(cls) if f.name not in ("xsph", "viscosity")}
         return cls(
@@ -82,8 +84,8 @@ def _checked(
 class Coefficients:
     """Parameters in internal units: floats, or tensors (members,); a term that is None is not computed."""
 
-    sound_speed: float | Tensor
-    gamma: float | Tensor
+    sound_speed: float | Tensor | None
+    gamma: float | Tensor | None
     smoothing_length: float | Tensor
     courant: float | Tensor
     background: float | Tensor | None
@@ -101,7 +103,7 @@ class Coefficients:
         viscosity = _acting(p.viscosity)
         if viscosity is not None:
             viscosity = viscosity / density / units.kinematic_viscosity
-        sound = p.sound_speed / units.speed
+        sound = None if p.sound_speed is None else p.sound_speed / units.speed
         artificial = _acting(p.artificial_viscosity)
         return cls(
             sound_speed=sound, gamma=p.gamma, smoothing_length=p.smoothing_ratio, courant=p.courant,

@@ -27,7 +27,7 @@ class Particles:
         members: B.
         label: (N,) int64, a numbering that survives sorting, or None.
         confidence: (N,), not negative, what a particle's velocity counts for in XSPH and in fetching; None: all alike.
-        pressure: (N,), time step times pressure over density of the last projection, or None (schemes without one).
+        pressure: (N,), p / rho0 of the last projection, or None (schemes without one).
     """
 
     position: Tensor

@@ -14,8 +14,8 @@ from .ensemble import assimilate
 from .forecast import ForecastSkill, skill
 from .observation_error import estimate_error
 from .particle_filter import filter_sph
+from .presets import preset as scheme_preset
 from .scene import Scene
-from .schemes import preset as scheme_preset
 from .simulator import Simulator
 from .smooth import FrameSmoother, smooth_frames
 

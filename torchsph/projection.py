@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -20,8 +20,13 @@ from .smoothing import kernel
 from .terms import shifting_displacement, softened_share
 from .walls import SMALLEST_SHARE, WallSample, completed, friction
 
+if TYPE_CHECKING:
+    from .simulator import Simulator
+
 # densities that a source can react to: what is denser or thinner by more is a fault of another kind
 _LARGEST_EXCESS = 0.3
+# particles that fill less of their walls leave a free surface
+_LEAST_FILLING = 0.9
 # a displacement of more than this (spacings) would outrun the linearisation
 _LARGEST_MOVE = 0.2
 
@@ -43,7 +48,8 @@ class Neighbourhood:
 
     def rates(self, terms: RateTerms) -> Rates:
         """First-pass sums."""
-        return self.search.backend.rates(self.pairs, self.particles.state(self.particles.deviation), self.support, terms)
+        state = self.particles.state(self.particles.deviation)
+        return self.search.backend.rates(self.pairs, state, self.support, terms)
 
     def excess(self, sums: Rates) -> Tensor:
         """Number density over the rest density, less 1: (N,), from Shepard's sum."""
@@ -119,6 +125,26 @@ def packing(around: Neighbourhood, *, tolerance: float = 3e-2, iterations: int =
     return move * (_LARGEST_MOVE / length.clamp_min(_LARGEST_MOVE)), excess
 
 
+def check_filled(simulator: Simulator, particles: Particles, time: float) -> None:
+    """ValueError where fluid does not fill its walls, or its box, though the scheme knows of no free surface."""
+    scheme, domain = simulator.scheme, simulator.domain
+    if scheme.surface is not None or particles.count == 0:
+        return
+    if domain.walls is not None:
+        volume = domain.fluid_volume(time) / simulator.scene.spacing**particles.dimension
+    elif domain.period is not None and bool(torch.isfinite(domain.period).all()):
+        volume = float(domain.period.prod())
+    else:
+        volume = float("inf")
+    inside = torch.where(particles.inside, particles.mass, torch.zeros_like(particles.mass))
+    filling = float(particles.per_member(inside, "sum").min()) / volume
+    if filling < _LEAST_FILLING:
+        raise ValueError(
+            f"the particles fill {100 * filling:.0f} % of what encloses them, so the fluid has a free surface: give "
+            "Projection(surface=0.85), or step with the weakly compressible scheme"
+        )
+
+
 class ProjectionStepper:
     """Steps particles with the incompressible scheme; holds the neighbour list, coefficients and the accounts."""
 
@@ -164,7 +190,9 @@ class ProjectionStepper:
         if self.scheme.relaxation is not None:
             excess = here.excess(sums)
             source = source + (excess if surface is None else excess.clamp_min(0.0)) / self.scheme.relaxation
-        push, found = here.push(source, self._guess(particles, dt), surface, self.scheme.tolerance, self.scheme.iterations)
+        push, found = here.push(
+            source, self._guess(particles, dt), surface, self.scheme.tolerance, self.scheme.iterations
+        )
         self._account(found, step)
         velocity = particles.velocity + push
         held = per_particle(torch.where(found.converged, step, torch.zeros_like(step)), particles.member)

@@ -24,6 +24,9 @@ class Record:
         limited_by: how many steps each limit decided, (members, limits); names in ``terms.LIMITS``.
         reductions: how often a limit asked for a step shorter than the step before by more than a hundredth.
         floored: steps that the scheme's floor kept longer than the limits asked for; such a run may be unstable.
+        pressure_iterations: of the solver of projections. unconverged: projections that ended without convergence.
+        largest_mismatch: largest mean divergence, internal, that no pressure could answer (a closed cavity whose volume
+            changes, or a flux that differs from it); it is spread evenly and so stays with the particles' volume.
         rollbacks: how often the member went back to an earlier state to try again with shorter steps.
         searches, overflows: neighbour searches, and those made again because the lists outgrew their room; both of all
             members together.
@@ -47,6 +50,9 @@ class Record:
     reductions: Tensor = field(init=False)
     floored: Tensor = field(init=False)
     rollbacks: Tensor = field(init=False)
+    pressure_iterations: Tensor = field(init=False)
+    unconverged: Tensor = field(init=False)
+    largest_mismatch: Tensor = field(init=False)
 
     def __post_init__(self) -> None:
         def counts(*shape: int) -> Tensor:
@@ -54,11 +60,12 @@ class Record:
 
         self.steps, self.outside, self.crossed_wall = counts(), counts(), counts()
         self.reductions, self.floored, self.rollbacks = counts(), counts(), counts()
+        self.pressure_iterations, self.unconverged = counts(), counts()
         self.inserted, self.removed, self.limited_by = counts(self.valves), counts(self.valves), counts(len(LIMITS))
         self.failed = torch.zeros(self.members, dtype=torch.bool, device=self.device)
         one = torch.ones(self.members, dtype=torch.float64, device=self.device)
         self.smallest_density, self.largest_density = one.clone(), one.clone()
-        self.largest_mach = torch.zeros_like(one)
+        self.largest_mach, self.largest_mismatch = torch.zeros_like(one), torch.zeros_like(one)
 
     def note_density(self, smallest: Tensor, largest: Tensor) -> None:
         """Widen the density range by deviations (members,) from the rest density."""
@@ -84,4 +91,6 @@ class Record:
             "removed": self.removed.tolist(), "limited_by": steps, "searches": self.searches,
             "reductions": self.reductions.tolist(), "floored": self.floored.tolist(),
             "rollbacks": self.rollbacks.tolist(), "overflows": self.overflows,
+            "pressure_iterations": self.pressure_iterations.tolist(), "unconverged": self.unconverged.tolist(),
+            "largest_mismatch": self.largest_mismatch.tolist(),
         }

@@ -45,8 +45,7 @@ class Reservoirs:
         self.valves = domain.scene.valves
         self.flat = domain.scheme.valve.profile == "flat"
         self.length = float(np.ceil(domain.support_radius) + 1.0)
-        # free channel between an outlet and its buffer: nothing inside then sees a prescribed particle
-        self.run_out = float(np.ceil(domain.support_radius))
+        self.run_out = domain.scheme.valve.run_out
         self.times, self.flux = self._flux_table()
         labels = {valve.region: number for number, valve in enumerate(self.valves)}
         # a region may consist of several openings; each has a buffer of its own
@@ -97,11 +96,9 @@ class Reservoirs:
         return part * (self.frame(number).area / total)
 
     def _lead(self, number: int) -> float:
-        """Length of the free channel before the buffer of an opening: 0 where fluid enters in the present interval.
-
-        A particle that leaves must not feel at once what is prescribed for it: at a Neumann boundary of the pressure
-        no pressure could bring it to the prescribed speed.
-        """
+        """Length of the free channel before the buffer of an opening: 0 where fluid enters in the present interval."""
+        if not self.run_out:
+            return 0.0
         middle = torch.tensor([self.domain.middle], dtype=torch.float64, device=self.domain.device)
         return self.run_out if float(self._flux_through(number, self.inflow(middle))) < 0.0 else 0.0
 

@@ -9,8 +9,11 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from .neighbours import PairSearch
+from .pairs import backend as choose_backend
 from .pairs.interface import PairState, RateTerms, Support
 from .particles import FLUID, Particles
+from .projection import Neighbourhood, packing
 from .schemes import CompleteKernelWall, PotentialWall
 from .smoothing import kernel
 from .walls import potential
@@ -33,22 +36,24 @@ class Seeding:
         kind: "boltzmann": random positions accepted with exp(-(U - U0) / T) (section 3.1.4 and its erratum);
             "quiet": a lattice cut by the walls, then relaxed until the crowding gradient is small.
         temperature: T in units of the wall potential at d = 0 (boltzmann).
-        relaxations: sweeps of the quiet start.
+        relaxations: sweeps of the quiet start that move particles down the gradient of their crowding.
+        packings: solves after them that even out the number density (``projection.packing``), open valves included.
         jitter: random displacement of lattice points, in spacings (quiet).
     """
 
     kind: str = "quiet"
     temperature: float = 0.1
     relaxations: int = 30
+    packings: int = 3
     jitter: float = 0.02
 
     def __post_init__(self) -> None:
         if self.kind not in ("boltzmann", "quiet"):
             raise ValueError(f"Seeding.kind must be 'boltzmann' or 'quiet', got '{self.kind}'")
-        if not self.temperature > 0 or self.relaxations < 0 or not 0 <= self.jitter < 0.5:
+        if not self.temperature > 0 or min(self.relaxations, self.packings) < 0 or not 0 <= self.jitter < 0.5:
             raise ValueError(
-                "Seeding needs temperature > 0, relaxations >= 0 and 0 <= jitter < 0.5, got "
-                f"{self.temperature}, {self.relaxations}, {self.jitter}"
+                "Seeding needs temperature > 0, relaxations and packings >= 0 and 0 <= jitter < 0.5, got "
+                f"{self.temperature}, {self.relaxations}, {self.packings}, {self.jitter}"
             )
 
 
@@ -74,7 +79,26 @@ def seed_particles(simulator: Simulator, time: float, generator: torch.Generator
         )
     volume = domain.fluid_volume(time) / simulator.scene.spacing**simulator.scene.dimension
     mass = torch.full_like(position[:, 0], volume / position.shape[0])
-    return _resting(position, mass)
+    resting = _resting(position, mass)
+    if seeding.kind != "quiet" or soft or not seeding.packings:
+        return resting
+    return packed(simulator, resting, time, seeding.packings)
+
+
+def packed(simulator: Simulator, particles: Particles, time: float, times: int) -> Particles:
+    """Particles whose number density is evened out, the channels of valves that are open at ``time`` (s) included."""
+    domain, scheme = simulator.domain, simulator.scheme
+    support = Support(kernel(scheme.kernel), scheme.smoothing_ratio, particles.dimension)
+    search = PairSearch(choose_backend(simulator.backend, simulator.device), support.radius, 0.5, domain.period)
+    domain.enter(time, time)
+    particles = domain.prepare(particles)
+    for _ in range(times):
+        here = Neighbourhood(particles, search, search.at(particles), support, domain.sample(particles))
+        particles = particles.changed(position=particles.position + packing(here)[0])
+        wall = domain.sample(particles)
+        off = torch.where(particles.fluid, (_CLEARANCE - wall.distance).clamp_min(0.0), torch.zeros_like(wall.distance))
+        particles = particles.changed(position=particles.position + off[:, None] * wall.normal)
+    return particles
 
 
 def _resting(position: Tensor, mass: Tensor) -> Particles:
@@ -171,9 +195,6 @@ def _quiet(
 
 def relaxed(simulator: Simulator, position: Tensor, mass: float, sweeps: int) -> Tensor:
     """Move particles of volume ``mass`` (internal) down the gradient of their crowding, kept off the walls."""
-    from .integrate import PairSearch
-    from .pairs import backend as choose_backend
-
     scheme = simulator.scheme
     support = Support(kernel(scheme.kernel), scheme.smoothing_ratio, position.shape[1])
     search = PairSearch(

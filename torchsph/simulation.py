@@ -12,11 +12,13 @@ from torch import Tensor
 
 from geometry import Grid
 
+from .incompressible import Projection
 from .integrate import Stepper
 from .neighbours import PairSearch
 from .pairs import backend as choose_backend
 from .parameters import Coefficients, Parameters
 from .particles import Particles
+from .projection import Neighbourhood, ProjectionStepper, check_filled, divergence_free
 from .record import Record
 from .rollback import Checkpoints
 from .schemes import CompleteKernelWall
@@ -58,7 +60,11 @@ class Simulation:
         self._backend = choose_backend(simulator.backend, simulator.device)
         search = PairSearch(self._backend, self.domain.support_radius, _SEARCH_MARGIN, self.domain.period)
         buffered = self.domain.reservoirs is not None
-        self._stepper = Stepper(scheme, self._coefficients, search, scene.dimension, buffered=buffered)
+        if isinstance(scheme, Projection):
+            check_filled(simulator, particles, self.time)
+            self._stepper = ProjectionStepper(scheme, self._coefficients, search, scene.dimension, self.record)
+        else:
+            self._stepper = Stepper(scheme, self._coefficients, search, scene.dimension, buffered=buffered)
         self._control = StepControl(self.record, scheme.step_floor)
         self._acceleration = torch.zeros_like(particles.position)
         self._imposed_at = self.time
@@ -83,7 +89,7 @@ class Simulation:
         if self.particles.count >= _SORT_FROM:
             self.particles = self.particles.labelled()
             self._sort(self._order)
-        longest = (until - self.time) / (self.simulator.scheme.steps_per_frame or 1) / self.units.time
+        longest = self._longest_step(until)
         for stop in self.domain.breaks(self.time, until):
             self.domain.enter(self.time, stop)
             self.particles = self.domain.prepare(self.particles)
@@ -97,6 +103,14 @@ class Simulation:
         self.record.overflows = self._backend.overflows
         self.domain.account(self.particles, self.record, self.time)
 
+    def _longest_step(self, until: float) -> float:
+        """Limit of the steps to time ``until`` (s) that the scheme names outright, internal."""
+        scheme = self.simulator.scheme
+        longest = (until - self.time) / (scheme.steps_per_frame or 1)
+        if isinstance(scheme, Projection) and scheme.max_step is not None:
+            longest = min(longest, scheme.max_step)
+        return longest / self.units.time
+
     def change(self, **values: float | Sequence[float] | Tensor | None) -> None:
         """Change parameters from now on: one number for all members, or a row (members,) with one for each.
 
@@ -104,6 +118,9 @@ class Simulation:
         where the scheme has no place for it.
         """
         scheme = self.simulator.scheme
+        changeable = ("shifting", "courant", "viscosity")
+        if isinstance(scheme, Projection) and not set(values) <= set(changeable):
+            raise ValueError(f"of the incompressible scheme only {', '.join(changeable)} can change, got {list(values)}")
         if values.get("xsph") is not None and scheme.xsph is None:
             raise ValueError("parameter 'xsph' needs a scheme with XSPH, which says of what level and form it is")
         complete = self.domain.walls is not None and isinstance(scheme.wall, CompleteKernelWall)
@@ -271,6 +288,25 @@ class Simulation:
         self._imposed_at = self.time
         self._forget_pairs()
 
+    @property
+    def can_project(self) -> bool:
+        """Whether ``project`` knows what the scene's walls ask for."""
+        return self.domain.walls is None or isinstance(self.simulator.scheme.wall, CompleteKernelWall)
+
+    def project(self, times: int = 1) -> None:
+        """Make the fluid's velocities free of divergence, as the walls and the flux of open valves ask for.
+
+        Costs ``times`` pressure solves; meant for velocities that were imposed, in scenes whose fluid fills its walls
+        or its periodic box.
+        """
+        if not self.can_project:
+            raise ValueError("projecting velocities needs complete-kernel walls; potential walls have no kernel share")
+        self.domain.enter(self.time, self.time)
+        wall = self.domain.sample(self.particles)
+        search = self._stepper.pair_search
+        here = Neighbourhood(self.particles, search, search.at(self.particles), self._stepper.support, wall)
+        self.particles = self.particles.changed(velocity=divergence_free(here, times=times)[0])
+
     def pull(self, grid: Grid, target: Tensor, gain: Tensor, weight: Tensor) -> None:
         """Pull the particles' velocities towards a measured grid.
 
@@ -314,4 +350,6 @@ def _held_rows(members: Tensor, particles: Particles, before: Tensor, after: Ten
 def _held(members: Tensor, before: Particles, after: Particles) -> Particles:
     """``after`` with the state of some members (members,) bool as it was before."""
     keep = {n: getattr(after, n) for n in ("position", "velocity", "deviation")}
+    if before.pressure is not None:
+        keep["pressure"] = after.pressure
     return after.changed(**{n: _held_rows(members, after, getattr(before, n), value) for n, value in keep.items()})

@@ -9,8 +9,8 @@ import torch
 from .domain import Domain
 from .pairs import backend as choose_backend
 from .particles import Particles
+from .presets import Scheme, preset
 from .scene import Scene
-from .schemes import WeaklyCompressible, preset
 from .seeding import Seeding, seed_particles
 from .simulation import Simulation
 from .units import Units
@@ -22,14 +22,14 @@ class Simulator:
 
     Args:
         scene: fluid, walls, valves, forces (SI).
-        scheme: ``WeaklyCompressible`` options; None takes the default preset.
+        scheme: ``Projection`` or ``WeaklyCompressible`` options; None takes the default preset.
         device, dtype: where and in what precision particles live (float32 or float64).
         backend: name of the pair backend, or "auto" for the best one present.
         seeding: how particles are placed; None takes what the scheme's walls call for.
     """
 
     scene: Scene
-    scheme: WeaklyCompressible | None = None
+    scheme: Scheme | None = None
     device: str = "cpu"
     dtype: torch.dtype = torch.float32
     backend: str = "auto"

@@ -33,7 +33,8 @@ class StepControl:
         speed = particles.per_member(square_length(particles.velocity), "amax").sqrt()
         force = particles.per_member(square_length(acceleration), "amax").sqrt()
         viscosity = 0.0 if c.viscosity is None else c.viscosity
-        limits = step_limits(speed, force, c.smoothing_length, c.sound_speed, viscosity, c.courant).double()
+        # of an incompressible fluid no signal but the flow itself limits the step
+        limits = step_limits(speed, force, c.smoothing_length, c.sound_speed or 0.0, viscosity, c.courant).double()
         active = left > 0
         frame = torch.full_like(limits[:1], longest)
         smallest, which = torch.cat([self._floored(limits, c, active), frame]).min(0)
@@ -45,8 +46,9 @@ class StepControl:
         which = torch.where(steps > 1, which, len(LIMITS) - 1)
         record.limited_by.scatter_add_(1, which[:, None], active[:, None].to(torch.int64))
         record.steps += active
-        mach = torch.where(active, (speed / c.sound_speed).double(), torch.zeros_like(left))
-        record.largest_mach = torch.maximum(record.largest_mach, mach)
+        if c.sound_speed is not None:
+            mach = torch.where(active, (speed / c.sound_speed).double(), torch.zeros_like(left))
+            record.largest_mach = torch.maximum(record.largest_mach, mach)
         return even
 
     def _floored(self, limits: Tensor, c: Coefficients, active: Tensor) -> Tensor:

@@ -35,7 +35,7 @@ def step_limits(
     the force limit is close to the customary 0.25 sqrt(h / |a|).
     """
     h = smoothing_length
-    acoustic = courant * h / (sound_speed + speed)
+    acoustic = courant * h / (sound_speed + speed).clamp_min(torch.finfo(speed.dtype).tiny)
     nu = torch.as_tensor(viscosity, dtype=speed.dtype, device=speed.device).expand_as(speed)
     viscous = courant * h * h / (8.0 * nu).clamp_min(torch.finfo(speed.dtype).tiny)
     force = courant * torch.sqrt(0.5 * h / acceleration.clamp_min(torch.finfo(speed.dtype).tiny))

@@ -35,11 +35,12 @@ class WallFields:
         motion: the walls (SI). spacing: particle spacing, m. speed: m/s per internal velocity.
         kernel, smoothing_length: of the pair sums, internal length; the margin around the walls follows from them.
         complete: whether the kernel's share and its gradient are wanted.
+        sliding: whether what the walls sweep is wanted as well (``CompleteKernelWall.sliding``).
     """
 
     def __init__(
         self, motion: WallMotion, spacing: float, speed: float, kernel: SmoothingKernel, smoothing_length: float,
-        complete: bool, device: str | torch.device, dtype: torch.dtype,
+        complete: bool, device: str | torch.device, dtype: torch.dtype, *, sliding: bool = False,
     ) -> None:
         self.motion, self.spacing, self.speed = motion, spacing, speed
         self.device, self.dtype = device, dtype
@@ -47,7 +48,7 @@ class WallFields:
         self.reach = kernel.support * smoothing_length  # internal
         self.grid = self._grid()
         self.dimension = self.grid.dimension
-        self.complete = complete
+        self.complete, self.sliding = complete, sliding
         self._share: KernelShare | None = None
         if complete:
             self._share = KernelShare(self.grid.shape, _FIELD_SPACING, kernel, smoothing_length, dtype)
@@ -63,7 +64,8 @@ class WallFields:
     def key(self, moment: int, open_regions: tuple[int, ...]) -> Tensor:
         """Fields at a moment (a number of ``moments.times``) with some regions open: (C, *shape), internal units.
 
-        Channels: distance, normal (D), wall velocity (D), and with ``complete`` share, share gradient (D).
+        Channels: distance, normal (D), wall velocity (D), with ``complete`` share, share gradient (D), with
+        ``sliding`` what the walls sweep.
         """
         label = (moment, open_regions)
         if label in self._made:
@@ -79,10 +81,12 @@ class WallFields:
         time = self.moments.times[moment]
         distance, velocity = self._distance(self.motion.surface(time), time, open_regions)
         d = torch.from_numpy(distance / self.spacing).to(self.dtype).reshape(self.grid.shape)
-        carried = torch.from_numpy(velocity.T / self.speed).to(self.dtype)
-        channels = [d[None], _normals(d), carried.reshape(-1, *self.grid.shape)]
+        carried = torch.from_numpy(velocity.T / self.speed).to(self.dtype).reshape(-1, *self.grid.shape)
+        channels = [d[None], _normals(d), carried]
         if self._share is not None:
             channels.extend(self._share.at(d))
+            if self.sliding:
+                channels.append(self._share.swept(d, (carried * channels[1]).sum(0), channels[1]))
         return torch.cat(channels).to(self.device)
 
     def _distance(
@@ -116,7 +120,8 @@ class WallFields:
         sample = (values[:, 0], normal, values[:, 1 + d : 1 + 2 * d])
         if not self.complete:
             return WallSample(*sample)
-        return WallSample(*sample, values[:, 1 + 2 * d], values[:, 2 + 2 * d :])
+        swept = values[:, 2 + 3 * d] if self.sliding else None
+        return WallSample(*sample, values[:, 1 + 2 * d], values[:, 2 + 2 * d : 2 + 3 * d], swept)
 
 
 def _open_channel(

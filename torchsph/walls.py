@@ -86,7 +86,10 @@ def completed(
     """
     if wall is None or wall.share is None:
         return divergence, crowding
-    swept = ((wall.velocity - velocity) * wall.share_gradient).sum(1)
+    if wall.swept is None:
+        swept = ((wall.velocity - velocity) * wall.share_gradient).sum(1)
+    else:
+        swept = wall.swept - (velocity * wall.share_gradient).sum(1)
     divergence = (divergence - swept) / wall.share.clamp_min(SMALLEST_SHARE)
     return divergence, None if crowding is None else crowding - wall.share_gradient
 

@@ -44,7 +44,7 @@ def one_run(resolution: int, duration: float, changes: dict | None) -> dict:
     changes = dict(changes) if changes is not None else None
     backend = "auto" if changes is None else changes.pop("backend", "auto")
     options = {} if changes is None else validation.PERIODIC_OPTIONS | changes
-    scheme = preset("default", **options)
+    scheme = preset("weakly_compressible", **options)
     scene = Scene(spacing=1 / resolution, fluid=Fluid(1.0, VISCOSITY), period=(1.0, 1.0), dimension=2)
     run = Simulator(scene, scheme, backend=backend, seeding=Seeding(jitter=0.0)).start(0.0)
     points = run.particles.position * scene.spacing

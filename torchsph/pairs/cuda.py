@@ -172,6 +172,7 @@ def triton_blocks(count: int, block: int) -> int:
     return (count + block - 1) // block
 
 
+_OLDEST_TRITON = (3, 3)  # the first whose kernels may hold tuples
 _TERMS = (
     "CONTINUITY", "DIFFUSION", "CONCENTRATION", "XSPH", "PRESSURE", "ARTIFICIAL", "LAMINAR", "TENSILE",
     "SHEPARD", "RENORMALISATION", "LAPLACIAN", "GRADIENT", "CORRECTED_DIFFUSION", "MOMENTS",
@@ -275,4 +276,6 @@ def status(device: str) -> tuple[bool, str]:
         import triton
     except ImportError:
         return False, "triton is not installed; it comes with torch's CUDA builds (pip install triton)"
+    if tuple(int(part) for part in triton.__version__.split(".")[:2]) < _OLDEST_TRITON:
+        return False, f"Triton {triton.__version__} is too old for the kernels: they need 3.3, from torch 2.7 on"
     return True, f"Triton {triton.__version__} on {torch.cuda.get_device_name()}"

@@ -62,29 +62,109 @@ def nearest(gap, period, PERIODIC: tl.constexpr):
 
 
 @triton.jit
-def store_vector(out, row, count, a, live, x, y, z, D: tl.constexpr):
-    """Write the components into rows of ``out``; the next free row."""
-    tl.store(out + row * count + a, x, mask=live)
-    tl.store(out + (row + 1) * count + a, y, mask=live)
+def load_vector(fields, row, count, at, mask, D: tl.constexpr):
+    """Rows ``row`` to ``row + D`` of ``fields`` at particles; the third component of a plane is 0."""
+    x = tl.load(fields + row * count + at, mask=mask, other=0.0)
+    y = tl.load(fields + (row + 1) * count + at, mask=mask, other=0.0)
+    z = 0.0 * x
     if D == 3:
-        tl.store(out + (row + 2) * count + a, z, mask=live)
+        z = tl.load(fields + (row + 2) * count + at, mask=mask, other=0.0)
+    return x, y, z
+
+
+@triton.jit
+def dot(a, b):
+    """Scalar product of two vectors."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@triton.jit
+def vector_sum(total, factor, a):
+    """total + factor a."""
+    return total[0] + factor * a[0], total[1] + factor * a[1], total[2] + factor * a[2]
+
+
+@triton.jit
+def matrix_sum(total, factor, a):
+    """total + factor a (x) a, for the entries xx, xy, xz, yy, yz, zz of a symmetric matrix."""
+    x = factor * a[0]
+    y = factor * a[1]
+    z = factor * a[2]
+    return (
+        total[0] + x * a[0], total[1] + x * a[1], total[2] + x * a[2],
+        total[3] + y * a[1], total[4] + y * a[2], total[5] + z * a[2],
+    )  # fmt: skip
+
+
+@triton.jit
+def store_scalar(out, row, count, a, live, value):
+    """Write a row of ``out``; the next free one."""
+    tl.store(out + row * count + a, value, mask=live)
+    return row + 1
+
+
+@triton.jit
+def store_vector(out, row, count, a, live, vector, D: tl.constexpr):
+    """Write the components into rows of ``out``; the next free row."""
+    tl.store(out + row * count + a, vector[0], mask=live)
+    tl.store(out + (row + 1) * count + a, vector[1], mask=live)
+    if D == 3:
+        tl.store(out + (row + 2) * count + a, vector[2], mask=live)
     return row + D
 
 
 @triton.jit
-def store_matrix(out, row, count, a, live, xx, xy, xz, yy, yz, zz, D: tl.constexpr):
+def store_matrix(out, row, count, a, live, matrix, D: tl.constexpr):
     """Write a symmetric matrix, row by row; the next free row of ``out``."""
-    tl.store(out + row * count + a, xx, mask=live)
-    tl.store(out + (row + 1) * count + a, xy, mask=live)
-    tl.store(out + (row + D) * count + a, xy, mask=live)
-    tl.store(out + (row + D + 1) * count + a, yy, mask=live)
+    tl.store(out + row * count + a, matrix[0], mask=live)
+    tl.store(out + (row + 1) * count + a, matrix[1], mask=live)
+    tl.store(out + (row + D) * count + a, matrix[1], mask=live)
+    tl.store(out + (row + D + 1) * count + a, matrix[3], mask=live)
     if D == 3:
-        tl.store(out + (row + 2) * count + a, xz, mask=live)
-        tl.store(out + (row + 5) * count + a, yz, mask=live)
-        tl.store(out + (row + 6) * count + a, xz, mask=live)
-        tl.store(out + (row + 7) * count + a, yz, mask=live)
-        tl.store(out + (row + 8) * count + a, zz, mask=live)
+        tl.store(out + (row + 2) * count + a, matrix[2], mask=live)
+        tl.store(out + (row + 5) * count + a, matrix[4], mask=live)
+        tl.store(out + (row + 6) * count + a, matrix[2], mask=live)
+        tl.store(out + (row + 7) * count + a, matrix[4], mask=live)
+        tl.store(out + (row + 8) * count + a, matrix[5], mask=live)
     return row + D * D
+
+
+@triton.jit
+def load_row(fields, row, count, at, mask, other, WANTED: tl.constexpr):
+    """A row of ``fields`` at particles, or ``other`` where no term wants it (and nothing is read)."""
+    value = other + 0.0 * at
+    if WANTED:
+        value = tl.load(fields + row * count + at, mask=mask, other=other)
+    return value
+
+
+@triton.jit
+def separation(place, other, period, PERIODIC: tl.constexpr, D: tl.constexpr):
+    """Gap x_a - x_b of the nearest images, and its square."""
+    x = nearest(place[0] - other[0], period[0], PERIODIC)
+    y = nearest(place[1] - other[1], period[1], PERIODIC)
+    z = place[2] - other[2]
+    square = x * x + y * y
+    if D == 3:
+        z = nearest(z, period[2], PERIODIC)
+        square += z * z
+    return (x, y, z), square
+
+
+@triton.jit
+def central_push(
+    stress, other, value, approach, viscosity, distance,
+    PRESSURE: tl.constexpr, ARTIFICIAL: tl.constexpr, TENSILE: tl.constexpr, tensile,
+):  # fmt: skip
+    """Pressure and artificial viscosity of a pair along its gap, before the kernel's slope."""
+    push = 0.0 * value
+    if PRESSURE:
+        push = stress + other
+        if TENSILE:
+            push += tensile * value * value * value * value * (tl.abs(stress) + tl.abs(other))
+    if ARTIFICIAL:
+        push -= viscosity * tl.minimum(approach, 0.0 * value) / distance
+    return push
 
 
 @triton.jit
@@ -103,181 +183,86 @@ def pair_sums(
     WEIGHT ... FIELD are rows of ``fields`` (position first, then velocity); ``coefficients`` has five numbers
     per member: 1/h, 0.01 h^2, 2 h times the artificial viscosity, laminar viscosity, tensile coefficient.
     """
+    RISES: tl.constexpr = (DIFFUSION or CORRECTED_DIFFUSION) or GRADIENT
+    INERT: tl.constexpr = XSPH or ARTIFICIAL
+    MASSES: tl.constexpr = SHEPARD or MOMENTS
     a = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     live = a < count
-    xa = tl.load(fields + a, mask=live, other=0.0)
-    ya = tl.load(fields + count + a, mask=live, other=0.0)
-    own = tl.load(member + a, mask=live, other=0)
-    inverse_length = tl.load(coefficients + 5 * own)
-    epsilon = tl.load(coefficients + 5 * own + 1)
-    zero = 0.0 * xa
-    px = tl.load(periods)  # by address: a scalar argument would be rounded to float32
-    py = tl.load(periods + 1)
-    pz = tl.load(periods + 2)
-    za = zero
-    ua = zero
-    va = zero
-    wa = zero
-    if D == 3:
-        za = tl.load(fields + 2 * count + a, mask=live, other=0.0)
+    own = coefficients + 5 * tl.load(member + a, mask=live, other=0)
+    inverse_length, epsilon = tl.load(own), tl.load(own + 1)
+    artificial, laminar, tensile = tl.load(own + 2), tl.load(own + 3), tl.load(own + 4)
+    # by address: a scalar argument would be rounded to float32
+    period = (tl.load(periods), tl.load(periods + 1), tl.load(periods + 2))
+    place = load_vector(fields, 0, count, a, live, D)
+    zero = 0.0 * place[0]
+    none = (zero, zero, zero)
+    velocity, own_slope = none, none
     if JUMPS:
-        ua = tl.load(fields + D * count + a, mask=live, other=0.0)
-        va = tl.load(fields + (D + 1) * count + a, mask=live, other=0.0)
-        if D == 3:
-            wa = tl.load(fields + (D + 2) * count + a, mask=live, other=0.0)
+        velocity = load_vector(fields, D, count, a, live, D)
+    if CORRECTED_DIFFUSION:
+        own_slope = load_vector(fields, SLOPE, count, a, live, D)
     stress = zero
     if PRESSURE:
         stress = tl.load(own_stress + a, mask=live, other=0.0)
-    inertia = zero
-    if XSPH or ARTIFICIAL:
-        inertia = tl.load(fields + INERTIA * count + a, mask=live, other=1.0)
-    inverse = zero
-    if LAMINAR:
-        inverse = tl.load(fields + INVERSE * count + a, mask=live, other=1.0)
-    deviation = zero
-    if DIFFUSION or CORRECTED_DIFFUSION or GRADIENT:
-        deviation = tl.load(fields + DEVIATION * count + a, mask=live, other=0.0)
-    slope_x = zero
-    slope_y = zero
-    slope_z = zero
-    if CORRECTED_DIFFUSION:
-        slope_x = tl.load(fields + SLOPE * count + a, mask=live, other=0.0)
-        slope_y = tl.load(fields + (SLOPE + 1) * count + a, mask=live, other=0.0)
-        if D == 3:
-            slope_z = tl.load(fields + (SLOPE + 2) * count + a, mask=live, other=0.0)
-    field = zero
-    if LAPLACIAN:
-        field = tl.load(fields + FIELD * count + a, mask=live, other=0.0)
-    artificial = tl.load(coefficients + 5 * own + 2)
-    laminar = tl.load(coefficients + 5 * own + 3)
-    tensile = tl.load(coefficients + 5 * own + 4)
+    inertia = load_row(fields, INERTIA, count, a, live, 1.0, INERT)
+    inverse = load_row(fields, INVERSE, count, a, live, 1.0, LAMINAR)
+    deviation = load_row(fields, DEVIATION, count, a, live, 0.0, RISES)
+    field = load_row(fields, FIELD, count, a, live, 0.0, LAPLACIAN)
 
-    divergence = zero
-    spread = zero
-    first_x = zero
-    first_y = zero
-    first_z = zero
-    drift_x = zero
-    drift_y = zero
-    drift_z = zero
-    force_x = zero
-    force_y = zero
-    force_z = zero
-    shepard_volume = zero
-    shepard_mass = zero
-    nxx = zero
-    nxy = zero
-    nxz = zero
-    nyy = zero
-    nyz = zero
-    nzz = zero
-    mass_x = zero
-    mass_y = zero
-    mass_z = zero
-    total = zero
-    diagonal = zero
-
+    divergence, spread, shepard_volume, shepard_mass, total, diagonal = zero, zero, zero, zero, zero, zero
+    first, mass_first, drift, force = none, none, none, none
+    second = (zero, zero, zero, zero, zero, zero)
     for r in range(RANGES):
-        first = tl.load(start + r * count + a, mask=live, other=0)
+        begin = tl.load(start + r * count + a, mask=live, other=0)
         last = tl.load(stop + r * count + a, mask=live, other=0)
-        longest = tl.max(last - first, axis=0)
-        for step in range(0, longest):
-            b = first + step
+        for step in range(0, tl.max(last - begin, axis=0)):
+            b = begin + step
             here = b < last
-            x = nearest(xa - tl.load(fields + b, mask=here, other=0.0), px, PERIODIC)
-            y = nearest(ya - tl.load(fields + count + b, mask=here, other=0.0), py, PERIODIC)
-            square = x * x + y * y
-            z = zero
-            if D == 3:
-                z = nearest(za - tl.load(fields + 2 * count + b, mask=here, other=0.0), pz, PERIODIC)
-                square += z * z
+            gap, square = separation(place, load_vector(fields, 0, count, b, here, D), period, PERIODIC, D)
             value, slope = kernel_shape(square * inverse_length * inverse_length, support, KERNEL)
             weight = tl.load(fields + WEIGHT * count + b, mask=here, other=0.0)
             slope = slope * weight
-            u = zero
-            v = zero
-            w = zero
+            distance = square + epsilon
+            pair_inertia = inertia + load_row(fields, INERTIA, count, b, here, 1.0, INERT)
+            rise = load_row(fields, DEVIATION, count, b, here, 0.0, RISES) - deviation
+            mass = load_row(fields, MASS, count, b, here, 0.0, MASSES) * value
+            jump, approach = none, zero
             if JUMPS:
-                u = ua - tl.load(fields + D * count + b, mask=here, other=0.0)
-                v = va - tl.load(fields + (D + 1) * count + b, mask=here, other=0.0)
-                if D == 3:
-                    w = wa - tl.load(fields + (D + 2) * count + b, mask=here, other=0.0)
-            approach = zero
+                jump = vector_sum(velocity, -1.0, load_vector(fields, D, count, b, here, D))
             if APPROACH:
-                approach = u * x + v * y + w * z
+                approach = dot(jump, gap)
             if CONTINUITY:
                 divergence -= slope * approach
             if DIFFUSION:
-                spread += slope * (deviation - tl.load(fields + DEVIATION * count + b, mask=here, other=0.0))
+                spread -= slope * rise
             if CORRECTED_DIFFUSION:
-                linear = x * (slope_x + tl.load(fields + SLOPE * count + b, mask=here, other=0.0))
-                linear += y * (slope_y + tl.load(fields + (SLOPE + 1) * count + b, mask=here, other=0.0))
-                if D == 3:
-                    linear += z * (slope_z + tl.load(fields + (SLOPE + 2) * count + b, mask=here, other=0.0))
-                drop = deviation - tl.load(fields + DEVIATION * count + b, mask=here, other=0.0)
-                spread += slope * (drop - 0.5 * linear)
+                both = vector_sum(own_slope, 1.0, load_vector(fields, SLOPE, count, b, here, D))
+                spread -= slope * (rise + 0.5 * dot(gap, both))
             if GRADIENT:
-                rise = tl.load(fields + DEVIATION * count + b, mask=here, other=0.0) - deviation
-                drift_x += slope * rise * x
-                drift_y += slope * rise * y
-                drift_z += slope * rise * z
+                drift = vector_sum(drift, slope * rise, gap)
             if MOMENTS:
-                volume = weight * value
-                mass = tl.load(fields + MASS * count + b, mask=here, other=0.0) * value
-                first_x -= volume * x
-                first_y -= volume * y
-                first_z -= volume * z
-                mass_x -= mass * x
-                mass_y -= mass * y
-                mass_z -= mass * z
-                nxx += volume * x * x
-                nxy += volume * x * y
-                nxz += volume * x * z
-                nyy += volume * y * y
-                nyz += volume * y * z
-                nzz += volume * z * z
+                first = vector_sum(first, -weight * value, gap)
+                mass_first = vector_sum(mass_first, -mass, gap)
+                second = matrix_sum(second, weight * value, gap)
             if CONCENTRATION:
-                first_x += slope * x
-                first_y += slope * y
-                first_z += slope * z
+                first = vector_sum(first, slope, gap)
             if SHEPARD:
                 shepard_volume += weight * value
-                shepard_mass += tl.load(fields + MASS * count + b, mask=here, other=0.0) * value
+                shepard_mass += mass
             if RENORMALISATION:
-                nxx -= slope * x * x
-                nxy -= slope * x * y
-                nxz -= slope * x * z
-                nyy -= slope * y * y
-                nyz -= slope * y * z
-                nzz -= slope * z * z
-            pair_inertia = zero + 1.0
-            if XSPH or ARTIFICIAL:
-                pair_inertia = inertia + tl.load(fields + INERTIA * count + b, mask=here, other=1.0)
-            distance = square + epsilon
+                second = matrix_sum(second, -slope, gap)
             if XSPH:
-                pull = weight * value / pair_inertia
-                drift_x -= pull * u
-                drift_y -= pull * v
-                drift_z -= pull * w
+                drift = vector_sum(drift, -weight * value / pair_inertia, jump)
             if PRESSURE or ARTIFICIAL:
-                push = zero
-                if PRESSURE:
-                    other = tl.load(fields + STRESS * count + b, mask=here, other=0.0)
-                    push = stress + other
-                    if TENSILE:
-                        push += tensile * value * value * value * value * (tl.abs(stress) + tl.abs(other))
-                if ARTIFICIAL:
-                    push -= artificial * tl.minimum(approach, zero) / (pair_inertia * distance)
-                push = push * slope
-                force_x -= push * x
-                force_y -= push * y
-                force_z -= push * z
+                other = load_row(fields, STRESS, count, b, here, 0.0, PRESSURE)
+                push = central_push(
+                    stress, other, value, approach, artificial, pair_inertia * distance,
+                    PRESSURE, ARTIFICIAL, TENSILE, tensile,
+                )  # fmt: skip
+                force = vector_sum(force, -push * slope, gap)
             if LAMINAR:
                 other = inverse + tl.load(fields + INVERSE * count + b, mask=here, other=1.0)
-                rate = laminar * slope * square / distance * other
-                force_x += rate * u
-                force_y += rate * v
-                force_z += rate * w
+                force = vector_sum(force, laminar * slope * square / distance * other, jump)
             if LAPLACIAN:
                 part = slope * square / distance
                 diagonal -= part
@@ -285,33 +270,28 @@ def pair_sums(
 
     row = 0
     if CONTINUITY:
-        tl.store(out + row * count + a, divergence, mask=live)
-        row += 1
+        row = store_scalar(out, row, count, a, live, divergence)
     if DIFFUSION:
-        tl.store(out + row * count + a, spread, mask=live)
-        row += 1
+        row = store_scalar(out, row, count, a, live, spread)
     if CONCENTRATION:
-        row = store_vector(out, row, count, a, live, first_x, first_y, first_z, D)
+        row = store_vector(out, row, count, a, live, first, D)
     if XSPH:
-        row = store_vector(out, row, count, a, live, drift_x, drift_y, drift_z, D)
-    if PRESSURE or ARTIFICIAL or LAMINAR:
-        row = store_vector(out, row, count, a, live, force_x, force_y, force_z, D)
+        row = store_vector(out, row, count, a, live, drift, D)
+    if (PRESSURE or ARTIFICIAL) or LAMINAR:
+        row = store_vector(out, row, count, a, live, force, D)
     if SHEPARD:
-        tl.store(out + row * count + a, shepard_volume, mask=live)
-        tl.store(out + (row + 1) * count + a, shepard_mass, mask=live)
-        row += 2
+        row = store_scalar(out, row, count, a, live, shepard_volume)
+        row = store_scalar(out, row, count, a, live, shepard_mass)
     if RENORMALISATION:
-        row = store_matrix(out, row, count, a, live, nxx, nxy, nxz, nyy, nyz, nzz, D)
+        row = store_matrix(out, row, count, a, live, second, D)
     if LAPLACIAN:
-        tl.store(out + row * count + a, total, mask=live)
-        tl.store(out + (row + 1) * count + a, diagonal, mask=live)
-        row += 2
+        row = store_scalar(out, row, count, a, live, total)
+        row = store_scalar(out, row, count, a, live, diagonal)
     if GRADIENT:
-        row = store_vector(out, row, count, a, live, drift_x, drift_y, drift_z, D)
+        row = store_vector(out, row, count, a, live, drift, D)
     if CORRECTED_DIFFUSION:
-        tl.store(out + row * count + a, spread, mask=live)
-        row += 1
+        row = store_scalar(out, row, count, a, live, spread)
     if MOMENTS:
-        row = store_vector(out, row, count, a, live, first_x, first_y, first_z, D)
-        row = store_matrix(out, row, count, a, live, nxx, nxy, nxz, nyy, nyz, nzz, D)
-        row = store_vector(out, row, count, a, live, mass_x, mass_y, mass_z, D)
+        row = store_vector(out, row, count, a, live, first, D)
+        row = store_matrix(out, row, count, a, live, second, D)
+        row = store_vector(out, row, count, a, live, mass_first, D)
