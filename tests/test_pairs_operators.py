@@ -158,7 +158,7 @@ class TestWrongInputs:
         choice = dataclasses.replace(
             support("cubic", 3), length=torch.full((64,), 1.2, dtype=torch.float64), per_particle=True
         )
-        with pytest.raises(ValueError, match="cpu backend has one smoothing length per member; use backend='reference'"):
+        with pytest.raises(ValueError, match="one smoothing length per member; use backend='reference'"):
             backend("cpu").rates(self.pairs(state), state, choice, RateTerms())
 
     def test_tensile_distance_outside_the_support(self):
