@@ -11,7 +11,7 @@ from torch.nn import functional
 
 from geometry import Grid, OrificePlane, Surface, WallMotion, grid_winding, orifices
 
-from .lookup import LookUp
+from .lookup import LookUp, by_node
 from .smoothing import SmoothingKernel
 from .wall_closest import closest_on_grid
 from .wall_moments import Moments
@@ -22,6 +22,8 @@ from .walls import WallSample
 _FIELD_SPACING = 0.5
 # distances outside the wall are exact this far (spacings): particles are put back long before
 _STRAY = 2.0
+# this far beyond the kernel's reach (spacings) the share is 1 and nothing else of the wall is asked for
+_FAR = 1.0
 # fields kept: the beat is run through in order, and a forecast of 40 ms spans about ten of them
 _KEPT = 24
 # of small grids more are kept, so that a second beat finds those of the first (bytes)
@@ -87,7 +89,7 @@ class WallFields:
             channels.extend(self._share.at(d))
             if self.sliding:
                 channels.append(self._share.swept(d, (carried * channels[1]).sum(0), channels[1]))
-        return torch.cat(channels).to(self.device)
+        return by_node(torch.cat(channels).to(self.device))
 
     def _distance(
         self, surface: Surface, time: float, open_regions: tuple[int, ...]
@@ -110,7 +112,7 @@ class WallFields:
 
     def between(self, first: Tensor, second: Tensor) -> LookUp:
         """The fields of two key frames made ready for look-ups between them."""
-        return LookUp(self.grid, first, second, self.spacing)
+        return LookUp(self.grid, first, second, self.spacing, plain=self.reach + _FAR)
 
     def sample(self, fields: LookUp, fraction: Tensor, position: Tensor) -> WallSample:
         """Walls at positions (N, D), internal; ``fraction`` (N,) or () of the way from the first key frame."""
