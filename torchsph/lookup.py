@@ -53,13 +53,14 @@ class LookUp:
     def _compiled(self, function: ctypes._CFuncPtr, points: Tensor, fraction: Tensor) -> Tensor:
         points, fraction = points.contiguous(), fraction.to(points.dtype).contiguous()
         out = points.new_empty((points.shape[0], self.channels))
-        dimension = points.shape[1]
+        triple, dimension = ctypes.c_double * 3, points.shape[1]
         function(ctypes.byref(LookUpArguments(
             dimension=dimension, threads=torch.get_num_threads(), channels=self.channels, count=points.shape[0],
             fractions=fraction.numel(), early=self._rows[0].data_ptr(),
-            late=None if self.steady else self._rows[1].data_ptr(), points=points.data_ptr(),
-            plain=None if self._plain is None else self._plain.data_ptr(), fraction=fraction.data_ptr(),
-            origin=(ctypes.c_double * 3)(*self._origin), step=(ctypes.c_double * 3)(*self._step), counts=(ctypes.c_int64 * 3)(*self._counts), out=out.data_ptr(),
+            late=None if self.steady else self._rows[1].data_ptr(),
+            plain=None if self._plain is None else self._plain.data_ptr(), points=points.data_ptr(),
+            fraction=fraction.data_ptr(), origin=triple(*self._origin), step=triple(*self._step),
+            counts=(ctypes.c_int64 * 3)(*self._counts), out=out.data_ptr(),
         )))
         return out
 
