@@ -2,15 +2,15 @@
 
     python examples/benchmarks/peers.py --pysph-python PATH [--quick] [--json FILE] [--spacing M] [--threads N]
 
+A column of water 1 m wide and 2 m high collapses in a tank of 4 m until the front has all but crossed it: the same
+fluid particles, the same physical time, the same number of threads. PySPH runs its own example (``dam_break_2d``:
+WCSPH in double precision, c = 10 sqrt(2 g H), artificial viscosity alpha = 0.1) in the interpreter that is named, which
+may be this one; its compilation is not timed. torchsph has, instead of alpha, the viscosity that it amounts to,
+alpha c h / 8 (Monaghan 2005 eq. 8.8), and is given once with half of PySPH's sound speed and once with the same.
+
 Measured with one thread on a machine with a load of 9 (0.02 m, 5000 particles): 40 CPU seconds of PySPH against 3.3 of
 torchsph (12x; 7x at the same sound speed), 11x in wall time; front errors 11 % and 9 % against 6 % and 4 %. With 800
-particles it is 3.5x: what is left there are the calls around the pair sums.
-
-A column of water 1 m wide and 2 m high collapses in a tank of 4 m until the front has all but crossed it: the same
-fluid particles, the same physical time, the same number of threads. PySPH runs its own example (``dam_break_2d``: WCSPH in
-double precision, c = 10 sqrt(2 g H), artificial viscosity alpha = 0.1) in the interpreter that is named, which may be
-this one; its compilation is not timed. torchsph has, instead of alpha, the viscosity that it amounts to, alpha c h / 8
-(Monaghan 2005 eq. 8.8), and is given once with half of PySPH's sound speed and once with the same.
+particles it is 3.5x: what counts there are the calls around the pair sums.
 
 Runs take turns and each competitor keeps its best time. Errors: mean of |x / x_measured - 1| over the points of Martin
 & Moyce 1952 and Koshizuka & Oka 1996.
