@@ -230,9 +230,10 @@ class Simulation:
         self.record.failed |= broken
         if bool(self.record.failed.all()):
             raise NumericalFailure(
-                f"all {self.members} members became non-finite after {self.record.steps.tolist()} steps at about "
-                f"{self.time:.6g} s; lower the Courant fraction, raise the sound speed, or check the imposed velocity "
-                f"(largest Mach number {float(self.record.largest_mach.max()):.2f})"
+                f"all {self.members} members have failed (not finite, or beyond the density that a rollback allows) "
+                f"after {self.record.steps.tolist()} steps at about {self.time:.6g} s; lower the Courant fraction, "
+                "raise the sound speed, or check the imposed velocity (largest Mach number "
+                f"{float(self.record.largest_mach.max()):.2f})"
             )
 
     def _fail_lost(self) -> None:
