@@ -11,6 +11,8 @@ from .krylov import Solution
 from .likelihood import Choice
 from .posterior import Posterior
 
+FWHM = 2.3548  # of a Gaussian, in standard deviations
+
 
 class SplineField:
     """v(x) = sum_j c_j B_j(x) (thesis eq. 3.5).
@@ -58,14 +60,32 @@ class SplineField:
         gradient = self.gradient(points, outside)
         return sum(gradient[:, k, k] for k in range(self.components))
 
-    def std(self, points: torch.Tensor, outside: float = float("nan")) -> torch.Tensor:
-        """Posterior standard deviation (n, C) in m/s at points (n, A); fit with ``uncertainty=True``."""
+    def laplacian(self, points: torch.Tensor, outside: float = float("nan")) -> torch.Tensor:
+        """(n, C): sum of the second derivatives along the axes of space, in 1/(m s)."""
+        orders = [[2 * int(a == j) for a in range(self.knots.axes)] for j in range(self.components)]
+        return sum(self._evaluate(points, orders, outside))
+
+    def std(self, points: torch.Tensor, outside: float = float("nan"), *, blur: float = 0.0) -> torch.Tensor:
+        """Posterior standard deviation (n, C) in m/s at points (n, A); fit with ``uncertainty=True``.
+
+        It is that of the random error: the samples' noise, and what the penalties leave open. What all samples
+        have in common is beyond the data, first of all that a measurement averages over its resolution cell.
+        ``blur``, the full width at half maximum of that cell in m, adds the square of the difference that a
+        Gaussian of this width makes to the fit, s^2 / 2 times its Laplacian to leading order in its deviation s.
+        It grows with the fit's own roughness, and errs on the small side where the finest scales are gone.
+        """
         if self.posterior is None:
             raise InvalidInput("this field holds no posterior: fit it with uncertainty=True")
+        if blur < 0:
+            raise InvalidInput(f"blur is {blur}: it must be >= 0")
         points = self._checked(points)
         supported = self.supported(points)
         out = torch.full((len(points), self.components), outside).to(self.coefficients)
-        out[supported] = self.posterior.variance(points[supported]).sqrt().to(out)
+        variance = self.posterior.variance(points[supported])
+        if blur:
+            deviation = blur / FWHM
+            variance = variance + (0.5 * deviation**2 * self.laplacian(points[supported]).double()).square()
+        out[supported] = variance.sqrt().to(out)
         return out
 
     def grid(

@@ -153,6 +153,14 @@ class TestWrongInputs:
                 self.pairs(state), state, type(support("cubic", 3))(own, 1.2, 3), RateTerms()
             )
 
+    def test_smoothing_length_of_each_particle(self):
+        state = disordered(4, 3)
+        choice = dataclasses.replace(
+            support("cubic", 3), length=torch.full((64,), 1.2, dtype=torch.float64), per_particle=True
+        )
+        with pytest.raises(ValueError, match="one smoothing length per member; use backend='reference'"):
+            backend("cpu").rates(self.pairs(state), state, choice, RateTerms())
+
     def test_tensile_distance_outside_the_support(self):
         state = disordered(4, 3)
         terms = MomentumTerms("symmetric", tensile=0.2, tensile_distance=5.0)

@@ -92,6 +92,34 @@ def test_z_scores_with_everything_chosen_from_the_data():
     assert 0.6 < float(score.square().mean().sqrt()) < 1.1
 
 
+def test_z_scores_of_a_blurred_measurement_need_its_blur():
+    """Waves that a Gaussian resolution cell damps by exp(-k^2 s^2 / 2): the samples agree on a wrong field."""
+    generator = torch.Generator().manual_seed(0)
+    points = torch.rand(3000, 3, generator=generator, dtype=torch.float64) * 15e-3
+    wave = 2 * torch.pi / 14e-3
+    x, y, z = (wave * points).unbind(1)
+    exact = torch.stack([torch.sin(y), torch.cos(z), torch.sin(x)], dim=1)
+    blur = 4e-3
+    damped = exact * float(torch.exp(torch.tensor(-0.5 * (wave * blur / 2.3548) ** 2)))
+    noise = 0.1 * torch.randn(exact.shape, generator=generator, dtype=torch.float64)
+    field = Smoother(robust=None).fit(points, damped + noise, uncertainty=True)
+    inner = ((points > 2e-3) & (points < 13e-3)).all(1)
+    off = (field(points) - exact)[inner]
+    assert float((off / field.std(points)[inner]).square().mean().sqrt()) > 5
+    assert 0.7 < float((off / field.std(points, blur=blur)[inner]).square().mean().sqrt()) < 1.5
+
+
+def test_laplacian_equals_autodiff():
+    where = torch.rand(200, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64) * 1e-2
+    field, points = Smoother(knots=4e-3, **SMALL).fit(where, torch.sin(300 * where)), where.clone().requires_grad_()
+    total = torch.zeros(200, 3, dtype=torch.float64)
+    for k in range(3):
+        (first,) = torch.autograd.grad(field(points)[:, k].sum(), points, create_graph=True)
+        for j in range(3):
+            total[:, k] += torch.autograd.grad(first[:, j].sum(), points, retain_graph=True)[0][:, j]
+    assert torch.allclose(field.laplacian(where), total, rtol=1e-6, atol=1e-6 * float(total.abs().max()))
+
+
 def test_std_needs_a_posterior_and_is_masked():
     points = torch.rand(100, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64) * 1e-2
     options = Smoother(**SMALL)
@@ -99,6 +127,8 @@ def test_std_needs_a_posterior_and_is_masked():
         options.fit(points, points).std(points)
     field = options.fit(points, points, uncertainty=True)
     assert torch.isnan(field.std(points + 1.0)).all() and (field.std(points) >= 0).all()
+    with pytest.raises(InvalidInput, match="blur"):
+        field.std(points, blur=-1e-3)
     with pytest.raises(InvalidInput, match="uncertainty"):
         Smoother(solver="lsqr", divergence=None, **SMALL).fit(points, points, uncertainty=True)
 

@@ -4,58 +4,40 @@ import numpy as np
 import pytest
 
 import geometry
-from torchsph import Scene, Seeding, Simulator, preset, validation
-from torchsph.scene import Fluid
-
-VISCOSITY = 0.1
+from torchsph import CompleteKernelWall, Scene, Simulator, preset, validation
+from torchsph.validation_runs import channel, channel_error
 
 
-def channel_error(flow, across, times, **changes):
-    """RMS velocity error over the largest velocity (1 m/s), at each of ``times`` (s)."""
-    spacing = 1 / across
-    length = 16 * spacing
-    corners = np.array([[-8 * spacing, 0], [length + 8 * spacing, 0], [length + 8 * spacing, 1], [-8 * spacing, 1]])
-    surface = geometry.polygon(corners, spacing)
-    rates = np.zeros_like(surface.vertices)
-    force = 8 * VISCOSITY if flow == "poiseuille" else 0.0
-    if flow == "couette":
-        rates[np.isclose(surface.vertices[:, 1], 1.0), 0] = 1.0
-    walls = geometry.WallMotion(np.zeros(1), surface.vertices[None], rates[None], surface.faces, surface.region)
-    scene = Scene(
-        spacing=spacing, fluid=Fluid(1.0, VISCOSITY), walls=walls, period=(length, None), gravity=(force, 0.0),
-        dimension=2,
-    )  # fmt: skip
-    scheme = preset("weakly_compressible", **(validation.CHANNEL_OPTIONS | changes))
-    run = Simulator(scene, scheme, seeding=Seeding(jitter=0.0)).start(0.0)
+def worst_error(flow, across, times, **changes):
+    """Largest RMS velocity error over the largest velocity (1 m/s) at any of ``times`` (s)."""
+    run = channel(flow, across, scheme=preset("weakly_compressible", **(validation.CHANNEL_OPTIONS | changes)))
     errors = []
     for time in times:
         run.advance(time)
-        height = run.particles.position[:, 1].double() * spacing
-        exact = (
-            validation.poiseuille_start(height, time, VISCOSITY, force, 1.0)
-            if flow == "poiseuille"
-            else validation.couette_start(height, time, VISCOSITY, 1.0, 1.0)
-        )
-        errors.append(float((run.particles.velocity[:, 0].double() - exact).square().mean().sqrt()))
+        errors.append(channel_error(run))
     assert int(run.record.outside.sum()) == 0 and not bool(run.record.failed.any())
-    return errors
+    return max(errors)
 
 
 @pytest.mark.parametrize(("flow", "bound"), [("poiseuille", 0.002), ("couette", 0.004)])
 def test_start_up_at_20_across(flow, bound):
-    """RMS error over the largest velocity, through the start-up to the steady state: measured 0.13 and 0.33 %.
+    """RMS error over the largest velocity, through the start-up to the steady state: measured 0.10 and 0.30 %.
 
-    The issue asks for 0.5 % at 40 across; 0.03 and 0.05 % are reached there at t = 0.5 s. Rows that are not centred
-    between the walls cost up to 1 %.
+    Rows that are not centred between the walls would cost up to 1 %.
     """
-    assert max(channel_error(flow, 20, (0.1, 0.5, 2.0))) < bound
+    assert worst_error(flow, 20, (0.1, 0.5, 2.0)) < bound
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("flow", ["poiseuille", "couette"])
+def test_start_up_at_40_across(flow):
+    """A quarter of the 0.5 % that the issue asks for, until t = 0.5 s: measured 0.03 and 0.10 %."""
+    assert worst_error(flow, 40, (0.1, 0.25, 0.5)) < 0.00125
 
 
 def test_no_slip_is_what_makes_the_profile():
     """With free slip a driven channel keeps accelerating as a plug: the error is of the size of the flow."""
-    from torchsph import CompleteKernelWall
-
-    assert channel_error("poiseuille", 20, (0.5,), wall=CompleteKernelWall(no_slip=False))[0] > 0.1
+    assert worst_error("poiseuille", 20, (0.5,), wall=CompleteKernelWall(no_slip=False)) > 0.1
 
 
 def test_walls_that_end_inside_the_period_are_refused():

@@ -30,10 +30,10 @@ from .smooth import smooth
 from .smoothing import KERNELS, SmoothingKernel, kernel
 
 __all__ = [
-    "DEFAULT_METHOD", "KERNELS", "METHODS", "PRESETS", "XSPH", "CompleteKernelWall", "EnsembleOptions", "EnsembleRun",
-    "FilteredRun", "Fluid", "ForecastSkill", "GammaRamp", "GridForecast", "MethodResult", "NumericalFailure",
-    "ObservationError", "PotentialWall", "PressureSource", "Projection", "Reservoir", "Rollback", "Scene", "Seeding",
-    "Simulation", "Simulator", "SmoothingKernel", "Transfer", "Valve", "WeaklyCompressible", "__version__", "assimilate",
-    "default_filter", "estimate_error", "filter_sph", "forecast_skill", "kernel", "make_model", "preset",
-    "run_methods", "skill", "smooth",
+    "DEFAULT_METHOD", "KERNELS", "METHODS", "PRESETS", "XSPH", "CompleteKernelWall", "EnsembleOptions",
+    "EnsembleRun", "FilteredRun", "Fluid", "ForecastSkill", "GammaRamp", "GridForecast", "MethodResult",
+    "NumericalFailure", "ObservationError", "PotentialWall", "PressureSource", "Projection", "Reservoir",
+    "Rollback", "Scene", "Seeding", "Simulation", "Simulator", "SmoothingKernel", "Transfer", "Valve",
+    "WeaklyCompressible", "__version__", "assimilate", "default_filter", "estimate_error", "filter_sph",
+    "forecast_skill", "kernel", "make_model", "preset", "run_methods", "skill", "smooth",
 ]  # fmt: skip

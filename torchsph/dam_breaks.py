@@ -5,11 +5,15 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import torch
 
 import geometry
 
+from .free_surface import resting_block, wall_pressure
 from .scene import Fluid, Scene
-from .simulator import Simulation
+from .simulation import Simulation
+from .simulator import Simulator
+from .validation import FREE_SURFACE_OPTIONS
 
 GRAVITY = 9.81  # m/s^2
 
@@ -24,11 +28,12 @@ KOSHIZUKA_OKA_1996 = np.array([
 ])  # fmt: skip
 
 # SPHERIC test 2 (Kleefsman et al. 2005 section 6): tank, column, obstacle (lower and upper corner), probes P1, P3; m.
-# The column's corners are rounded to whole particles by the caller.
 OBSTACLE_TANK = ((0.0, -0.5, 0.0), (3.22, 0.5, 1.0))
 OBSTACLE_COLUMN = ((0.0, -0.5, 0.0), (1.228, 0.5, 0.55))
 OBSTACLE = ((2.42, -0.2, 0.0), (2.58, 0.2, 0.161))
 OBSTACLE_PROBES = ((2.42, 0.0, 0.021), (2.42, 0.0, 0.101))
+# Waves that hit walls: without this damping single particles at the obstacle ring with 5 rho g H
+IMPACT_OPTIONS = FREE_SURFACE_OPTIONS | {"smoothing_ratio": 1.6, "bulk_damping": 1.0, "artificial_viscosity": 0.1}
 
 
 def column_scene(spacing: float, width: float = 1.0, *, viscosity: float = 0.001) -> Scene:
@@ -60,6 +65,26 @@ def obstacle_scene(spacing: float) -> Scene:
         spacing=spacing, fluid=Fluid(1000.0, 0.001), gravity=(0.0, 0.0, -GRAVITY),
         walls=geometry.WallMotion.at_rest(walls), reference_speed=math.sqrt(2 * GRAVITY * OBSTACLE_COLUMN[1][2]),
     )  # fmt: skip
+
+
+def obstacle_run(simulator: Simulator) -> Simulation:
+    """The column of SPHERIC's second test at rest, its sides rounded to whole spacings of ``obstacle_scene``."""
+    spacing = simulator.scene.spacing
+    lower, upper = np.array(OBSTACLE_COLUMN)
+    size = np.rint((upper - lower) / spacing) * spacing
+    lower[1] = -0.5 * size[1]  # the measured plane stays the middle
+    return simulator.resume(resting_block(simulator, lower, lower + size), 0.0)
+
+
+def obstacle_pressures(run: Simulation, until: float, every: float = 0.005) -> tuple[np.ndarray, np.ndarray]:
+    """Advance to ``until`` (s), reading the probes: times (n,), s, and p / (rho g H) (n, 2) at P1 and P3."""
+    probes = torch.tensor(OBSTACLE_PROBES, dtype=torch.float64)
+    unit = run.simulator.scene.fluid.density * GRAVITY * OBSTACLE_COLUMN[1][2]
+    times, readings = np.arange(run.time + every, until + 0.5 * every, every), []
+    for time in times:
+        run.advance(float(time))
+        readings.append(wall_pressure(run, probes)[0].numpy() / unit)
+    return times, np.stack(readings)
 
 
 def surge_front(run: Simulation) -> float:

@@ -217,14 +217,17 @@ class Domain:
         moved = after.position - before.position - dt[:, None] * wall.velocity
         distance = wall.distance + (moved * wall.normal).sum(1)
         gap = self.scheme.wall.gap
-        near = (distance < gap) & after.fluid
-        record.crossed_wall += after.per_member((near & (distance < 0)).to(torch.int64), "sum")
-        push = torch.where(near, gap - distance, torch.zeros_like(distance))
-        towards = ((after.velocity - wall.velocity) * wall.normal).sum(1).clamp_max(0.0)
-        stop = torch.where(near, towards, torch.zeros_like(towards))
+        # few particles are that close: the rest is for them alone
+        near = torch.nonzero((distance < gap) & after.fluid).squeeze(1)
+        if near.numel() == 0:
+            return after
+        distance, normal = distance[near], wall.normal[near]
+        record.crossed_wall.index_add_(0, after.member[near], (distance < 0).to(torch.int64))
+        velocity = after.velocity[near]
+        towards = ((velocity - wall.velocity[near]) * normal).sum(1).clamp_max(0.0)
         return after.changed(
-            position=after.position + push[:, None] * wall.normal,
-            velocity=after.velocity - stop[:, None] * wall.normal,
+            position=after.position.index_add(0, near, (gap - distance)[:, None] * normal),
+            velocity=after.velocity.index_add(0, near, -towards[:, None] * normal),
         )
 
     def _wrapped(self, particles: Particles) -> Particles:

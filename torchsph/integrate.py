@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from .neighbours import PairSearch
-from .pairs.centroid import centroid_xsph
 from .pairs.interface import MomentumTerms, Rates, RateTerms, Support, per_particle
 from .parameters import Coefficients
 from .particles import Particles
@@ -19,6 +18,7 @@ from .smoothing import kernel
 from .terms import mls_deviation, shepard_deviation, shifting_displacement, softened_share, tait_pressure
 from .transfer import solve_small
 from .walls import SMALLEST_SHARE, WallSample, completed, friction, potential_force, retardation, wall_pressure_force
+from .xsph import neighbour_pull
 
 
 class Surroundings(Protocol):
@@ -117,7 +117,7 @@ class Stepper:
         drift = torch.zeros_like(particles.position)
         if self.position_xsph is not None:
             share = per_particle(step * self.position_xsph, particles.member)
-            drift = drift + share[:, None] * self._pull(seen, rates.xsph)
+            drift = drift + share[:, None] * self._xsph(seen, rates.xsph)
         if crowding is not None:
             drift = drift + shifting_displacement(
                 particles, crowding, step, self.coefficients.smoothing_length, self.coefficients.shifting,
@@ -136,21 +136,8 @@ class Stepper:
         fluid = particles.fluid.reshape(-1, *[1] * (values.ndim - 1))
         return torch.where(fluid, values, torch.zeros_like(values))
 
-    def _pull(self, particles: Particles, plain: Tensor | None) -> Tensor:
-        """XSPH's sum (N, D), ``plain`` where it is the full one without confidences.
-
-        A confidence multiplies the mass of a neighbour (thesis 5.2: "the correlation could be encoded in the mass").
-        """
-        if not self._centroid and particles.confidence is None:
-            return plain
-        state = self._pressureless(particles)
-        if particles.confidence is not None:
-            state = replace(state, mass=state.mass * particles.confidence)
-        if self._centroid:
-            # 1.5 cells reach as far as the kernel, so that adjacent cells hold all of it
-            return centroid_xsph(state, self.support, self.support.radius / 1.5, self.pair_search.period)
-        search = self.pair_search
-        return search.backend.rates(search.at(particles), state, self.support, RateTerms(None, xsph=True)).xsph
+    def _xsph(self, particles: Particles, plain: Tensor | None) -> Tensor:
+        return neighbour_pull(particles, plain, self.support, self.pair_search, self._centroid)
 
     def evaluate_rates(self, particles: Particles, pairs: Any, wall: WallSample | None) -> RateSums:
         """Density rate and its companions at one state."""
@@ -186,7 +173,7 @@ class Stepper:
             state = particles
             sums = backend.rates(pairs, self._pressureless(state), self.support, wanted)
             if smoothing:
-                pull = self._pull(state, sums.xsph)
+                pull = self._xsph(state, sums.xsph)
                 share = per_particle(self.velocity_xsph, particles.member)
                 share = share[:, None] if isinstance(share, Tensor) else share
                 particles = particles.changed(velocity=particles.velocity + share * pull)

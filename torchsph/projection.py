@@ -27,6 +27,9 @@ if TYPE_CHECKING:
 _LARGEST_EXCESS = 0.3
 # particles that fill less of their walls leave a free surface
 _LEAST_FILLING = 0.9
+_TINY = 1e-6
+# classes of the kernel's share inside the walls, in which particles are compared
+_SHARES = 16
 # a displacement of more than this (spacings) would outrun the linearisation
 _LARGEST_MOVE = 0.2
 
@@ -51,9 +54,27 @@ class Neighbourhood:
         state = self.particles.state(self.particles.deviation)
         return self.search.backend.rates(self.pairs, state, self.support, terms)
 
-    def excess(self, sums: Rates) -> Tensor:
-        """Number density over the rest density, less 1: (N,), from Shepard's sum."""
-        return (sums.shepard_volume / self.share - 1.0).clamp(-_LARGEST_EXCESS, _LARGEST_EXCESS)
+    def filling(self, sums: Rates) -> Tensor:
+        """Number density relative to that of particles at rest density, (N,), from Shepard's sum."""
+        return sums.shepard_volume / self.share
+
+    def excess(self, filling: Tensor, counted: Tensor) -> Tensor:
+        """Filling relative to the mean of the member's particles whose kernel is cut alike by walls, less 1: (N,).
+
+        At walls particles stand in layers, where the sum is off by percents all the time: against a common mean that
+        would be a source that never ends, and drive a flow along the walls. It is 0 where not ``counted`` (N,) bool, and
+        has no mean, so that it takes no part in what flows through a valve.
+        """
+        p = self.particles
+        group = p.member
+        if self.wall is not None:
+            group = group * (_SHARES + 1) + (self.wall.share * _SHARES).to(torch.int64)
+        weight = counted.to(filling.dtype)
+        size = p.members * (_SHARES + 1)
+        count = filling.new_zeros(size).index_add(0, group, weight)
+        mean = filling.new_zeros(size).index_add(0, group, weight * filling) / count.clamp_min(1.0)
+        excess = (filling / mean[group].clamp_min(_TINY) - 1.0).clamp(-_LARGEST_EXCESS, _LARGEST_EXCESS)
+        return torch.where(counted, excess, torch.zeros_like(excess))
 
     def push(
         self, source: Tensor, start: Tensor | None, surface: Tensor | None, tolerance: float, iterations: int
@@ -119,8 +140,8 @@ def packing(around: Neighbourhood, *, tolerance: float = 3e-2, iterations: int =
     The displacement is minus the gradient of a potential whose Laplacian is the excess: one Newton step towards a
     packing that shifting would take hundreds of sweeps to reach.
     """
-    excess = around.excess(around.rates(RateTerms(continuity=None, shepard=True)))
-    move, _ = around.push(excess, None, None, tolerance, iterations)
+    excess = around.filling(around.rates(RateTerms(continuity=None, shepard=True))) - 1.0
+    move, _ = around.push(excess.clamp(-_LARGEST_EXCESS, _LARGEST_EXCESS), None, None, tolerance, iterations)
     length = move.norm(dim=1, keepdim=True)
     return move * (_LARGEST_MOVE / length.clamp_min(_LARGEST_MOVE)), excess
 
@@ -185,11 +206,13 @@ class ProjectionStepper:
         here = Neighbourhood(particles, self.pair_search, pairs, self.support, wall)
         sums = here.rates(self._terms)
         divergence, crowding = completed(sums.divergence, sums.concentration, particles.velocity, wall)
-        surface = None if self.scheme.surface is None else sums.shepard_volume / here.share < self.scheme.surface
-        source = -divergence
+        surface, source = None, -divergence
+        filling = here.filling(sums) if self._terms.shepard else None
+        if self.scheme.surface is not None:
+            surface = filling < self.scheme.surface
         if self.scheme.relaxation is not None:
-            excess = here.excess(sums)
-            source = source + (excess if surface is None else excess.clamp_min(0.0)) / self.scheme.relaxation
+            counted = particles.inside if surface is None else particles.inside & ~surface
+            source = source + here.excess(filling, counted) / self.scheme.relaxation
         push, found = here.push(
             source, self._guess(particles, dt), surface, self.scheme.tolerance, self.scheme.iterations
         )

@@ -46,26 +46,45 @@ class Reservoirs:
         self.flat = domain.scheme.valve.profile == "flat"
         self.length = float(np.ceil(domain.support_radius) + 1.0)
         self.run_out = domain.scheme.valve.run_out
-        self.times, self.flux = self._flux_table()
+        self.times, self.flux, self.volume = self._tables()
+        self.relaxation = domain.scheme.valve.relaxation
         labels = {valve.region: number for number, valve in enumerate(self.valves)}
         # a region may consist of several openings; each has a buffer of its own
         self.openings = [one for one in orifices(self.motion) if one.label in labels]
         self.valve_of = [labels[one.label] for one in self.openings]
         self._frames: dict[tuple[int, int], _Frame] = {}
 
-    def _flux_table(self) -> tuple[np.ndarray, np.ndarray]:
+    def _tables(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Times, dV/dt and V of the cavity, internal but for the times (s)."""
         key = np.asarray(self.motion.time)
-        if len(key) == 1:
-            return key, np.zeros(1)
         share = np.arange(_FLUX_SAMPLES) / _FLUX_SAMPLES
         times = np.append((key[:-1, None] + share * np.diff(key)[:, None]).ravel(), key[-1])
-        unit = self.units.length**self.motion.dimension / self.units.time
-        return times, np.array([self.motion.volume_rate(t) for t in times]) / unit
+        unit = self.units.length**self.motion.dimension
+        rate = np.array([self.motion.volume_rate(t) for t in times]) * (self.units.time / unit)
+        return times, rate, np.array([self.motion.volume(t) for t in times]) / unit
+
+    def _looked_up(self, table: np.ndarray, times: Tensor) -> Tensor:
+        period = self.motion.period
+        places = times.cpu().numpy()
+        if period:
+            places = self.times[0] + np.mod(places - self.times[0], period)
+        return torch.as_tensor(np.interp(places, self.times, table), dtype=self.domain.dtype, device=self.domain.device)
 
     def inflow(self, times: Tensor) -> Tensor:
         """dV/dt at times (s), internal: what has to enter through the open valves together."""
-        value = np.interp(times.cpu().numpy(), self.times, self.flux)
-        return torch.as_tensor(value, dtype=self.domain.dtype, device=self.domain.device)
+        return self._looked_up(self.flux, times)
+
+    def _deficit(self, particles: Particles, times: Tensor) -> Tensor:
+        """Volume that the particles inside fall short of the cavity's, (members,), internal.
+
+        A particle in an open orifice counts by the part that is inside, so that the sum does not jump as it crosses.
+        """
+        part = particles.inside.to(particles.mass.dtype)
+        for _, frame in self._active():
+            height = frame.height(particles.position)
+            near = (height.abs() < 0.5) & ((particles.position - frame.centre).square().sum(1) < (frame.radius + 1.0) ** 2)
+            part = torch.where(near, 0.5 - height, part)
+        return self._looked_up(self.volume, times) - particles.per_member(part * particles.mass, "sum")
 
     def frame(self, number: int) -> _Frame:
         """Opening ``number`` in the middle of the present interval (openings move little within one)."""
@@ -74,8 +93,11 @@ class Reservoirs:
         if label not in self._frames:
             if len(self._frames) > _KEPT_FRAMES:
                 self._frames.clear()
-            plane = self.openings[number].at(time)
-            self._frames[label] = _Frame(plane, self.units.length, self.domain.dtype, self.domain.device)
+            opening = self.openings[number]
+            self._frames[label] = _Frame(
+                opening.at(time), opening.velocity(time) / self.units.speed, self.units.length, self.domain.dtype,
+                self.domain.device,
+            )
         return self._frames[label]
 
     def _active(self) -> list[tuple[int, _Frame]]:
@@ -123,7 +145,8 @@ class Reservoirs:
         place = frame.lattice(lead + self.length)
         kind = torch.where(frame.height(place) < lead, CHANNEL - number, RESERVOIR + number)
         count, copies = place.shape[0], members.numel()
-        mass = torch.stack([particles.mass[particles.member == m].mean() for m in members.tolist()])
+        # a lattice does not tile an opening: its particles share the channel's volume
+        mass = place.new_full((members.numel(),), frame.area * (lead + self.length) / max(count, 1))
         new = Particles(
             position=place.repeat(copies, 1), velocity=place.new_zeros((count * copies, place.shape[1])),
             deviation=self._mouth_deviation(particles, frame, members).repeat_interleave(count),
@@ -145,6 +168,8 @@ class Reservoirs:
         """Give the buffers' particles their velocity for the present time; with ``channel`` also the free channels'."""
         times = self.domain.member_times(particles.members)
         inflow = self.inflow(times)
+        if self.relaxation is not None and not channel:
+            inflow = inflow + self._deficit(particles, times) / self.relaxation
         velocity = particles.velocity
         for number, frame in self._active():
             mine, length = particles.kind == RESERVOIR + number, self.length
@@ -153,10 +178,12 @@ class Reservoirs:
             row = torch.nonzero(mine).squeeze(1)
             owner, old = particles.member[row], velocity[row]
             along = (old * frame.normal).sum(1)
-            own = self._orifice_velocity(frame)
+            own = frame.velocity
             speed = -self._flux_through(number, inflow) / frame.area  # outward
-            share = frame.area * length / self._volume(particles, row)
-            target = self._profile(along - (own * frame.normal).sum(), owner, speed * share.clamp(*_AREA_TRUST))
+            # what enters must be what is wanted, however full the buffer is; what leaves follows the fluid before it
+            share = (frame.area * length / self._volume(particles, row)).clamp(*_AREA_TRUST)
+            speed = torch.where(speed < 0.0, speed * share, speed)
+            target = self._profile(along - (own * frame.normal).sum(), owner, speed)
             new = own + target[:, None] * frame.normal
             velocity = velocity.index_copy(0, row, new)
         return particles.changed(velocity=velocity)
@@ -180,12 +207,6 @@ class Reservoirs:
         flat = mean < 1e-5
         scale = torch.where(flat, speed, speed / mean.clamp_min(1e-5))
         return torch.where(flat[owner], ones, shape) * scale[owner]
-
-    def _orifice_velocity(self, frame: _Frame) -> Tensor:
-        """Velocity of the orifice itself (D,) in the present interval, from its key-frame motion."""
-        if frame.velocity is None:
-            frame.velocity = self.domain.sample_at(frame.centre[None]).velocity[0]
-        return frame.velocity
 
     def exchange(self, particles: Particles, record: Record) -> tuple[Particles, bool]:
         """Turn particles that have crossed an open orifice into the other kind; feed and clear the far ends."""
@@ -239,7 +260,9 @@ class Reservoirs:
 class _Frame:
     """An opening in internal units on the device."""
 
-    def __init__(self, plane: OrificePlane, length: float, dtype: torch.dtype, device: str) -> None:
+    def __init__(
+        self, plane: OrificePlane, velocity: np.ndarray, length: float, dtype: torch.dtype, device: str,
+    ) -> None:
         def tensor(value: np.ndarray) -> Tensor:
             return torch.as_tensor(np.ascontiguousarray(value), dtype=dtype, device=device)
 
@@ -249,7 +272,7 @@ class _Frame:
         )
         self.centre, self.normal, self.basis = tensor(self._plane.centroid), tensor(plane.normal), tensor(plane.basis)
         self.area = float(self._plane.area)
-        self.velocity: Tensor | None = None
+        self.velocity = tensor(velocity)
         self.radius = float(np.linalg.norm(self._plane.outline, axis=1).max())
 
     def height(self, position: Tensor) -> Tensor:

@@ -120,7 +120,8 @@ class Simulation:
         scheme = self.simulator.scheme
         changeable = ("shifting", "courant", "viscosity")
         if isinstance(scheme, Projection) and not set(values) <= set(changeable):
-            raise ValueError(f"of the incompressible scheme only {', '.join(changeable)} can change, got {list(values)}")
+            known = ", ".join(changeable)
+            raise ValueError(f"of the incompressible scheme only {known} can change, got {list(values)}")
         if values.get("xsph") is not None and scheme.xsph is None:
             raise ValueError("parameter 'xsph' needs a scheme with XSPH, which says of what level and form it is")
         complete = self.domain.walls is not None and isinstance(scheme.wall, CompleteKernelWall)
@@ -247,9 +248,10 @@ class Simulation:
         self.record.failed |= broken
         if bool(self.record.failed.all()):
             raise NumericalFailure(
-                f"all {self.members} members became non-finite after {self.record.steps.tolist()} steps at about "
-                f"{self.time:.6g} s; lower the Courant fraction, raise the sound speed, or check the imposed velocity "
-                f"(largest Mach number {float(self.record.largest_mach.max()):.2f})"
+                f"all {self.members} members have failed (not finite, or beyond the density that a rollback allows) "
+                f"after {self.record.steps.tolist()} steps at about {self.time:.6g} s; lower the Courant fraction, "
+                "raise the sound speed, or check the imposed velocity (largest Mach number "
+                f"{float(self.record.largest_mach.max()):.2f})"
             )
 
     def _fail_lost(self) -> None:

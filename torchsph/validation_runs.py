@@ -38,7 +38,8 @@ def taylor_green(
     plane = dimension == 2
     side = 1.0 if plane else 2 * math.pi
     if scheme is None:
-        scheme = preset("weakly_compressible", **(validation.PERIODIC_OPTIONS if plane else validation.PERIODIC_OPTIONS_3D))
+        options = validation.PERIODIC_OPTIONS if plane else validation.PERIODIC_OPTIONS_3D
+        scheme = preset("weakly_compressible", **options)
     scene = Scene(
         spacing=side / resolution, fluid=Fluid(1.0, 1 / reynolds), period=(side,) * dimension, dimension=dimension
     )

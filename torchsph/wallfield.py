@@ -11,7 +11,7 @@ from torch.nn import functional
 
 from geometry import Grid, OrificePlane, Surface, WallMotion, grid_winding, orifices
 
-from .lookup import LookUp
+from .lookup import LookUp, by_node
 from .smoothing import SmoothingKernel
 from .wall_closest import closest_on_grid
 from .wall_moments import Moments
@@ -22,6 +22,8 @@ from .walls import WallSample
 _FIELD_SPACING = 0.5
 # distances outside the wall are exact this far (spacings): particles are put back long before
 _STRAY = 2.0
+# this far beyond the kernel's reach (spacings) the share is 1 and nothing else of the wall is asked for
+_FAR = 1.0
 # fields kept: the beat is run through in order, and a forecast of 40 ms spans about ten of them
 _KEPT = 24
 # of small grids more are kept, so that a second beat finds those of the first (bytes)
@@ -87,7 +89,7 @@ class WallFields:
             channels.extend(self._share.at(d))
             if self.sliding:
                 channels.append(self._share.swept(d, (carried * channels[1]).sum(0), channels[1]))
-        return torch.cat(channels).to(self.device)
+        return by_node(torch.cat(channels).to(self.device))
 
     def _distance(
         self, surface: Surface, time: float, open_regions: tuple[int, ...]
@@ -105,12 +107,14 @@ class WallFields:
         depth = (self.reach + 2.0) * self.spacing
         for opening in self._openings:
             if opening.label in open_regions:
-                _open_channel(distance, self.grid, inside, opening.at(time), depth)
+                channel = _open_channel(distance, self.grid, inside, opening.at(time), depth)
+                # the channel goes with its orifice as a whole: a rim that closes in must not squeeze what is beyond it
+                carried[channel] = opening.velocity(time)
         return distance, carried
 
     def between(self, first: Tensor, second: Tensor) -> LookUp:
         """The fields of two key frames made ready for look-ups between them."""
-        return LookUp(self.grid, first, second, self.spacing)
+        return LookUp(self.grid, first, second, self.spacing, plain=self.reach + _FAR)
 
     def sample(self, fields: LookUp, fraction: Tensor, position: Tensor) -> WallSample:
         """Walls at positions (N, D), internal; ``fraction`` (N,) or () of the way from the first key frame."""
@@ -126,8 +130,11 @@ class WallFields:
 
 def _open_channel(
     distance: np.ndarray, grid: Grid, inside: np.ndarray, opening: OrificePlane, depth: float
-) -> None:
-    """Count the straight channel behind an open orifice as fluid, as far as any kernel sees, in ``distance`` (n,)."""
+) -> np.ndarray:
+    """Count the straight channel behind an open orifice as fluid, as far as any kernel sees, in ``distance`` (n,).
+
+    Returns the nodes in the channel and beside it, whose walls are the channel's.
+    """
     # the channel lies within this of the orifice's centre
     reach = np.hypot(np.linalg.norm(opening.outline, axis=1).max(), 2.0 * depth)
     first = np.floor((opening.centroid - reach - np.asarray(grid.origin)) / grid.spacing).astype(np.int64)
@@ -140,13 +147,16 @@ def _open_channel(
     height = opening.height(points).numpy()
     near = np.flatnonzero((height > -0.1 * depth) & (height < 2.0 * depth))
     lateral = opening.lateral(points[near]).numpy()
-    bounds = opening.outline.min(0), opening.outline.max(0)
-    near = near[((lateral >= bounds[0]) & (lateral <= bounds[1])).all(1)]
+    # beside it as far as an interpolation reaches
+    margin = 2.0 * max(grid.spacing)
+    lower, upper = opening.outline.min(0) - margin, opening.outline.max(0) + margin
+    near = near[((lateral >= lower) & (lateral <= upper)).all(1)]
     inset = opening.lateral_distance(points[near]).numpy()
-    # beside the channel the rim, a part of the solid faces, already gives the distance
-    over = inset > 0
-    where = index[near[over]]
+    over, beside = inset > 0, (inset <= 0) & (inset > -margin) & (height[near] > 0)
+    where, outer = index[near[over]], index[near[beside]]
     distance[where] = np.minimum(np.abs(distance[where]), inset[over])
+    distance[outer] = np.maximum(distance[outer], inset[beside])
+    return np.concatenate([index[near[over & (height[near] > 0)]], outer])
 
 
 def _normals(distance: Tensor) -> Tensor:

@@ -68,6 +68,17 @@ typedef struct { /* closest surface points of the nodes of a regular grid, x fas
   double *distance, *carried; /* (nodes,) and (nodes, dimension): the values at the closest point */
 } sph_closest;
 
+typedef struct { /* fields on a regular grid, looked up at points; see look_up.cpp */
+  int32_t dimension, threads;
+  int64_t channels, count, fractions; /* fractions: 1 for all points, or count */
+  const void *early, *late;           /* (nodes, channels), x fastest; late null: nothing changes */
+  const uint8_t* plain;               /* (nodes,) cells, by their lowest corner, that take its early values; or null */
+  const void *points, *fraction;      /* (count, dimension), (fractions,) of the way from early to late */
+  double origin[3], step[3];
+  int64_t counts[3];                  /* nodes along x, y, z, at least 2 each */
+  void* out;                          /* (count, channels) */
+} sph_look_up;
+
 #ifdef __cplusplus
 extern "C" {
 #endif
@@ -80,6 +91,8 @@ int sph_pass_f32(const sph_pass*);
 int sph_pass_f64(const sph_pass*);
 int64_t sph_interpolate_f32(const sph_interpolation*); /* number of unusable particles and queries; 0: done */
 int64_t sph_interpolate_f64(const sph_interpolation*);
+void sph_look_up_f32(const sph_look_up*);
+void sph_look_up_f64(const sph_look_up*);
 void sph_grid_closest(const sph_closest*);
 int sph_runs(const char* instruction_set);             /* whether this processor has it */
 double sph_fma(int threads, int64_t turns, float factor); /* float32 multiply-adds; the flop done */

@@ -7,7 +7,7 @@ import itertools
 import torch
 from torch import Tensor
 
-from .interface import PairState, Support, check_search, per_particle
+from .interface import PairState, Support, check_search, per_particle, square_length
 from .search import _key, _shifted, nearest_image, placed_cells
 
 
@@ -25,27 +25,32 @@ def centroid_xsph(state: PairState, support: Support, cell: float, period: Tenso
         ValueError: ``cell`` is not positive, a position is not finite, or a period is under three cells.
     """
     check_search(state.position, cell, period)
-    count, dimension = state.position.shape
-    if count == 0:
+    dimension = state.position.shape[1]
+    if state.position.shape[0] == 0:
         return torch.zeros_like(state.velocity)
     index, cells, lower, width = placed_cells(state.position, cell, period)
     keys, own = torch.unique(_key(index, state.member, cells), return_inverse=True)
+    count = keys.shape[0]
+    place, member = index.new_empty((count, dimension)), state.member.new_empty(count)
+    place[own], member[own] = index, state.member
 
     def total(values: Tensor) -> Tensor:
-        return values.new_zeros((keys.shape[0], *values.shape[1:])).index_add(0, own, values)
+        return values.new_zeros((count, *values.shape[1:])).index_add(0, own, values)
 
     mass, volume = total(state.mass), total(state.volume)
     # a cell of weightless particles pulls nobody
     velocity = total(state.mass[:, None] * state.velocity) / mass.clamp_min(torch.finfo(mass.dtype).tiny)[:, None]
     length = per_particle(support.length, state.member)
-    pull = torch.zeros_like(state.velocity)
+    middle = lower + (index.to(lower.dtype) + 0.5) * width
+    inside = nearest_image(state.position - middle, period)
+    pull, weights = torch.zeros_like(state.velocity), torch.zeros_like(state.mass)
     for offset in itertools.product((-1, 0, 1), repeat=dimension):
-        target, real = _shifted(index, offset, cells, period)
-        wanted = _key(target, state.member, cells)
-        at = torch.searchsorted(keys, wanted).clamp_max(keys.shape[0] - 1)
-        found = real & (keys[at] == wanted)
-        middle = lower + (target.to(lower.dtype) + 0.5) * width
-        distance = nearest_image(state.position - middle, period).norm(dim=1)
-        weight = support.kernel.value(distance, length, dimension) * volume[at] * found
-        pull = pull + weight[:, None] * (velocity[at] - state.velocity)
-    return pull
+        target, real = _shifted(place, offset, cells, period)
+        wanted = _key(target, member, cells)
+        at = torch.searchsorted(keys, wanted).clamp_max(count - 1)
+        acting = volume[at] * (real & (keys[at] == wanted))
+        gap = inside - torch.tensor(offset, dtype=width.dtype, device=width.device) * width
+        weight = support.kernel.value(square_length(gap).sqrt(), length, dimension) * acting.index_select(0, own)
+        pull = pull + weight[:, None] * velocity[at].index_select(0, own)
+        weights = weights + weight
+    return pull - weights[:, None] * state.velocity

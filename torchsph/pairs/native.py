@@ -131,6 +131,27 @@ class ClosestArguments(ctypes.Structure):
     ]
 
 
+class LookUpArguments(ctypes.Structure):
+    """sph_look_up of csrc/interface.h."""
+
+    _fields_ = [
+        ("dimension", _int),
+        ("threads", _int),
+        ("channels", _long),
+        ("count", _long),
+        ("fractions", _long),
+        ("early", _pointer),
+        ("late", _pointer),
+        ("plain", _pointer),
+        ("points", _pointer),
+        ("fraction", _pointer),
+        ("origin", _real * 3),
+        ("step", _real * 3),
+        ("counts", _long * 3),
+        ("out", _pointer),
+    ]
+
+
 @dataclass(frozen=True)
 class Library:
     """A loaded library and the instruction set it was compiled for."""
@@ -202,6 +223,8 @@ def _declare(handle: ctypes.CDLL) -> ctypes.CDLL:
         listing.argtypes = [ctypes.POINTER(SearchArguments), _long, ctypes.POINTER(ListArguments)]
         listing.restype = _long
         getattr(handle, f"sph_pass_{reals}").argtypes = [ctypes.POINTER(PassArguments)]
+        look_up = getattr(handle, f"sph_look_up_{reals}")
+        look_up.argtypes, look_up.restype = [ctypes.POINTER(LookUpArguments)], None
         interpolate = getattr(handle, f"sph_interpolate_{reals}")
         interpolate.argtypes, interpolate.restype = [ctypes.POINTER(InterpolationArguments)], _long
     handle.sph_grid_closest.argtypes, handle.sph_grid_closest.restype = [ctypes.POINTER(ClosestArguments)], None

@@ -1,0 +1,165 @@
+"""Error of spatial smoothers on measurements whose truth is known, everything chosen automatically.
+
+    python examples/benchmarks/spline_phantom.py TRUTH.h5 MEASURED.h5 [MEASURED.h5 ...] [--every 4]
+                                                 [--pymust PYTHON] [--json FILE]
+
+Methods, frame by frame: the measurement as it is, weighted Gaussian smoothing of 3 mm full width at half maximum, the
+thesis's spline preset (table 4.1), PyMUST's ``smoothn`` (robust, generalised cross-validation, weights squared;
+D. Garcia, Comput. Stat. Data Anal. 54 (2010) 1167), and this package's spline as it comes, alone and averaged over
+time (Gaussian of 10 ms). No method sees the truth. ``--pymust`` names a Python that has PyMUST where this one has not.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+
+import numpy as np
+import torch
+from scipy.ndimage import gaussian_filter
+
+import geometry
+import regularize
+from torchsph.metrics import matching_frames
+from torchsph.smooth import FrameSmoother, node_weights
+
+WIDTH = 3e-3  # m, full width at half maximum of the Gaussian
+BLUR = 10e-3  # s, standard deviation of the average over time
+FAST = 0.1  # of the highest true speed: slower nodes have no direction worth scoring
+PYMUST = """
+import sys
+import numpy as np
+from pymust import smoothn
+file = np.load(sys.argv[1])
+velocity, weight = file["velocity"], file["weight"]
+out = [smoothn(list(frame), W=w.copy(), isrobust=True)[0] for frame, w in zip(velocity, weight)]
+np.save(sys.argv[2], np.array(out))
+"""
+
+
+def gaussian(velocity: np.ndarray, weight: np.ndarray, spacing: np.ndarray) -> np.ndarray:
+    """Normalised convolution of (D, *shape) with weights (*shape)."""
+    sigma = WIDTH / 2.3548 / np.asarray(spacing)[::-1]
+    share = gaussian_filter(weight, sigma)
+    parts = [gaussian_filter(np.nan_to_num(part) * weight, sigma) for part in velocity]
+    return np.stack([np.where(share > 1e-9, part / np.maximum(share, 1e-9), 0.0) for part in parts])
+
+
+def smoothn(measured: geometry.Recording, frames: list[int], python: str) -> np.ndarray | None:
+    """(frames, D, *shape) from PyMUST in the interpreter ``python``; None, with a message, where it lacks PyMUST."""
+    if subprocess.run([python, "-c", "import pymust"], capture_output=True, check=False).returncode:
+        print(f"{python} has no PyMUST: smoothn is left out (pip install pymust, or --pymust PYTHON)", file=sys.stderr)
+        return None
+    with tempfile.TemporaryDirectory() as folder:
+        given, found = Path(folder) / "given.npz", Path(folder) / "found.npy"
+        velocity = np.nan_to_num(measured.velocity[frames]).astype(np.float64)
+        weight = np.stack([node_weights(measured, frame).astype(np.float64) ** 2 for frame in frames])
+        np.savez(given, velocity=velocity, weight=weight)
+        subprocess.run([python, "-c", PYMUST, str(given), str(found)], check=True, capture_output=True)
+        return np.load(found)
+
+
+class Splines:
+    """Fits of some frames of a measurement, on its nodes, and what their analytic derivatives say."""
+
+    def __init__(self, measured: geometry.Recording, smoother: regularize.Smoother) -> None:
+        self.frames = FrameSmoother(measured, smoother, choose_every=1)
+        self.divergence = self.gradient = 0.0
+
+    def __call__(self, frame: int) -> np.ndarray:
+        fitted = self.frames.fit(frame)
+        mask = torch.from_numpy(np.array(self.frames.recording.mask[frame], bool).reshape(-1))
+        gradient = fitted.gradient(self.frames.nodes[mask], outside=0.0)
+        self.divergence += float(gradient.diagonal(dim1=1, dim2=2).sum(1).square().sum())
+        self.gradient += float(gradient.square().sum())
+        return self.frames.on_grid(fitted, frame)
+
+    @property
+    def divergence_share(self) -> float:
+        """RMS of the divergence over RMS of the gradient."""
+        return (self.divergence / self.gradient) ** 0.5
+
+
+def over_time(fields: np.ndarray, mask: np.ndarray, times: np.ndarray) -> np.ndarray:
+    """Average over the frames (F, D, *shape) in which a node lies in the mask (F, *shape)."""
+    kernel = np.exp(-0.5 * ((times[:, None] - times) / BLUR) ** 2)
+    share = np.einsum("fg,g...->f...", kernel, mask.astype(float))
+    total = np.einsum("fg,gd...->fd...", kernel, fields * mask[:, None])
+    return total / np.maximum(share, 1e-9)[:, None]
+
+
+def scores(field: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> dict:
+    """NRMSE and mean direction error (degrees) of (F, D, *shape) over the mask (F, *shape)."""
+    v, u = (np.moveaxis(each, 1, -1)[mask].astype(np.float64) for each in (field, truth))
+    speed = np.linalg.norm(u, axis=1)
+    fast = speed > FAST * speed.max()
+    cosine = (v * u).sum(1)[fast] / np.maximum(np.linalg.norm(v, axis=1)[fast] * speed[fast], 1e-12)
+    return {
+        "nrmse": float(np.sqrt(((v - u) ** 2).sum() / (u**2).sum())),
+        "direction_error_deg": float(np.degrees(np.arccos(np.clip(cosine, -1, 1))).mean()),
+    }
+
+
+def compare(truth: geometry.Recording, measured: geometry.Recording, every: int, python: str) -> list[dict]:
+    """One row per method."""
+    truth = truth.select(matching_frames(measured.time, truth.time, "the truth"))
+    frames = list(range(0, measured.frames, every))
+    mask, right = np.asarray(truth.mask[frames], bool), truth.velocity[frames]
+    rows = []
+
+    def add(name: str, field: np.ndarray | None, start: float, **more: object) -> None:
+        if field is None:
+            return
+        seconds = (time.perf_counter() - start) / len(frames)
+        rows.append({"method": name, **scores(np.nan_to_num(field), right, mask), "seconds_per_frame": seconds, **more})
+        line = "  {method:24s} NRMSE {nrmse:.3f}  direction {direction_error_deg:.1f} deg"
+        print(line.format(**rows[-1]), flush=True)
+
+    add("measured", measured.velocity[frames], time.perf_counter())
+    start, weight = time.perf_counter(), [node_weights(measured, f).astype(np.float64) for f in frames]
+    smooth = [gaussian(measured.velocity[f], w, measured.grid.spacing) for f, w in zip(frames, weight, strict=True)]
+    add("Gaussian, 3 mm", np.stack(smooth), start)
+    start = time.perf_counter()
+    add("PyMUST smoothn", smoothn(measured, frames, python), start)
+    for name, preset in (("spline, thesis preset", "thesis"), ("spline", "default")):
+        start, fit = time.perf_counter(), Splines(measured, regularize.Smoother.preset(preset))
+        fields = np.stack([fit(frame) for frame in frames])
+        choices = [fit.frames.choice(frame) for frame in frames]
+        more = {"divergence_share": fit.divergence_share}
+        if all(choices):
+            more["curvature_mm"] = [1e3 * choice.curvature for choice in choices]
+            more["noise_m_s"] = [list(choice.noise) for choice in choices]
+            more["no_slip"] = [choice.no_slip for choice in choices]
+        add(name, fields, start, **more)
+    if every == 1:  # else the neighbours in time are not there
+        add("spline, 10 ms average", over_time(fields, mask, measured.time), start)
+    return rows
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("truth", type=Path)
+    parser.add_argument("measured", type=Path, nargs="+")
+    parser.add_argument("--every", type=int, default=4, help="take every so manieth frame")
+    parser.add_argument("--pymust", default=sys.executable, help="a Python that has PyMUST")
+    parser.add_argument("--json", type=Path, help="also write the rows here")
+    parser.add_argument("--threads", type=int, default=1)
+    options = parser.parse_args()
+    torch.set_num_threads(options.threads)
+    truth, found = geometry.read_recording(options.truth), {}
+    for path in options.measured:
+        print(path.name)
+        found[path.name] = compare(truth, geometry.read_recording(path), options.every, options.pymust)
+    if options.json:
+        options.json.write_text(json.dumps(found, indent=1))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,113 @@
+// Multilinear look-up of many fields at once, between two moments: the rows of a point's corners are read whole.
+#include <omp.h>
+
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+#include <cstring>
+#include <limits>
+
+#include "interface.h"
+
+namespace {
+
+// By its bits: the library is compiled for finite numbers.
+bool finite(float x) {
+  uint32_t bits;
+  std::memcpy(&bits, &x, sizeof bits);
+  return (bits & 0x7f800000u) != 0x7f800000u;
+}
+
+bool finite(double x) {
+  uint64_t bits;
+  std::memcpy(&bits, &x, sizeof bits);
+  return (bits & 0x7ff0000000000000u) != 0x7ff0000000000000u;
+}
+
+// Where a point lies: the lower corner of its cell, the share of each axis, and whether it lies anywhere.
+template <class Real, int D>
+struct Place {
+  int64_t node = 0;
+  Real share[D];
+  bool usable = true;
+
+  void find(const sph_look_up& a, const Real* point) {
+    int64_t stride = 1;
+    node = 0, usable = true;
+    for (int k = 0; k < D; ++k) {
+      const Real place = (point[k] - Real(a.origin[k])) / Real(a.step[k]);
+      usable = usable && finite(place);
+      const Real low = usable ? std::min(std::max(std::floor(place), Real(0)), Real(a.counts[k] - 2)) : Real(0);
+      share[k] = std::min(std::max(place - low, Real(0)), Real(1));
+      node += int64_t(low) * stride, stride *= a.counts[k];
+    }
+  }
+};
+
+template <class Real, int D>
+void look_up(const sph_look_up& a) {
+  constexpr int64_t corners = 1 << D, block = 16;
+  const int64_t channels = a.channels;
+  const auto *early = static_cast<const Real*>(a.early), *late = static_cast<const Real*>(a.late);
+  const auto *points = static_cast<const Real*>(a.points), *fractions = static_cast<const Real*>(a.fraction);
+  Real* out = static_cast<Real*>(a.out);
+  int64_t offset[corners];  // of the corners of a cell, in nodes
+  for (int64_t c = 0; c < corners; ++c) {
+    int64_t stride = 1;
+    offset[c] = 0;
+    for (int k = 0; k < D; stride *= a.counts[k], ++k) offset[c] += (c >> k & 1) * stride;
+  }
+#pragma omp parallel for schedule(static) num_threads(a.threads)
+  for (int64_t start = 0; start < a.count; start += block) {
+    const int64_t stop = std::min(a.count, start + block);
+    Place<Real, D> places[block];
+    // the tables are far larger than the caches: ask for all rows of a block before the first is used
+    for (int64_t n = start; n < stop; ++n) {
+      Place<Real, D>& place = places[n - start];
+      place.find(a, points + n * D);
+      if (a.plain && a.plain[place.node]) {
+        __builtin_prefetch(early + place.node * channels);
+        continue;
+      }
+      for (int64_t c = 0; c < corners; c += 2)  // the two corners along x lie side by side
+        for (const Real* table : {early, late})
+          if (table) {
+            const char* row = reinterpret_cast<const char*>(table + (place.node + offset[c]) * channels);
+            for (int64_t byte = 0; byte < 2 * channels * int64_t(sizeof(Real)); byte += 64) __builtin_prefetch(row + byte);
+          }
+    }
+    for (int64_t n = start; n < stop; ++n) {
+      const Place<Real, D>& place = places[n - start];
+      Real* sum = out + n * channels;
+      if (!place.usable) {
+        std::fill(sum, sum + channels, std::numeric_limits<Real>::quiet_NaN());
+        continue;
+      }
+      if (a.plain && a.plain[place.node]) {
+        std::copy(early + place.node * channels, early + (place.node + 1) * channels, sum);
+        continue;
+      }
+      std::fill(sum, sum + channels, Real(0));
+      const Real after = late ? fractions[a.fractions == 1 ? 0 : n] : Real(0);
+      for (int64_t c = 0; c < corners; ++c) {
+        Real weight = 1;
+        for (int k = 0; k < D; ++k) weight *= c >> k & 1 ? place.share[k] : 1 - place.share[k];
+        const int64_t at = (place.node + offset[c]) * channels;
+        const Real before = late ? weight * (1 - after) : weight;
+        for (int64_t i = 0; i < channels; ++i) sum[i] += before * early[at + i];
+        if (late)
+          for (int64_t i = 0; i < channels; ++i) sum[i] += weight * after * late[at + i];
+      }
+    }
+  }
+}
+
+template <class Real>
+void run(const sph_look_up& a) {
+  a.dimension == 2 ? look_up<Real, 2>(a) : look_up<Real, 3>(a);
+}
+
+}  // namespace
+
+extern "C" void sph_look_up_f32(const sph_look_up* arguments) { run<float>(*arguments); }
+extern "C" void sph_look_up_f64(const sph_look_up* arguments) { run<double>(*arguments); }
