@@ -63,7 +63,8 @@ class Reservoirs:
 
     def inflow(self, times: Tensor) -> Tensor:
         """dV/dt at times (s), internal: what has to enter through the open valves together."""
-        value = np.interp(times.cpu().numpy(), self.times, self.flux)
+        wrapped = [self.domain.walls.moments.wrapped(time) for time in times.tolist()]
+        value = np.interp(wrapped, self.times, self.flux)
         return torch.as_tensor(value, dtype=self.domain.dtype, device=self.domain.device)
 
     def frame(self, number: int) -> _Frame:
