@@ -6,7 +6,7 @@ import torch
 
 import geometry
 from geometry.closest import SurfaceIndex
-from torchsph import Scene, Simulator
+from torchsph import Scene, Simulator, preset
 from torchsph.scene import Valve
 from torchsph.smoothing import kernel
 from torchsph.wall_moments import Moments
@@ -92,17 +92,24 @@ def test_a_beat_is_run_through_again_and_again():
     assert len(moments.within(0.0, 1.0)) == 5 * (len(moments.times) - 1) + 1
 
 
+def breathing():
+    """A ventricle of fixed shape that breathes at 2.5 Hz, its inlet open for longer than a beat."""
+    body, times = geometry.Ventricle().surface(2e-3), np.arange(9) * 0.05
+    places = body.vertices * (1 + 0.05 * np.sin(2 * np.pi * times / 0.4))[:, None, None]
+    motion = geometry.WallMotion.through(times, places, body.faces, body.region, period=0.4)
+    return Scene(spacing=3e-3, walls=motion, valves=(Valve(1, ((0.0, 1.0),)),))
+
+
 def test_reservoirs_fill_the_second_beat_as_the_first():
-    """A ventricle that breathes: what enters through its open inlet follows dV/dt in every period."""
-    body = geometry.Ventricle().surface(2e-3)
-    times = np.arange(9) * 0.05
-    motion = geometry.WallMotion.through(
-        times, body.vertices * (1 + 0.05 * np.sin(2 * np.pi * times / 0.4))[:, None, None], body.faces, body.region,
-        period=0.4,
-    )  # fmt: skip
-    scene = Scene(spacing=3e-3, walls=motion, valves=(Valve(1, ((0.0, 1.0),)),))
-    reservoirs = Simulator(scene).domain.reservoirs
+    reservoirs = Simulator(breathing()).domain.reservoirs
     first = reservoirs.inflow(torch.tensor([0.05, 0.13, 0.3], dtype=torch.float64))
     later = reservoirs.inflow(torch.tensor([0.45, 0.53, 1.5], dtype=torch.float64))
     assert float(first.abs().min()) > 0
     torch.testing.assert_close(first, later)
+
+
+def test_pressure_sources_push_in_the_second_beat_as_in_the_first():
+    sources = Simulator(breathing(), preset("thesis")).domain.sources
+    assert sources.strength(0.53) == pytest.approx(sources.strength(0.13)) != 0.0
+    for which in (0, 1):
+        torch.testing.assert_close(sources._at(1, 0.53, which), sources._at(1, 0.13, which))
