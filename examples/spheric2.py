@@ -33,7 +33,7 @@ from torchsph.dam_breaks import (
     obstacle_pressures,
     obstacle_run,
     obstacle_scene,
-)  # fmt: skip
+)
 from torchsph.simulation import Simulation
 
 SECTION_TIMES = (0.45, 0.8)  # s
@@ -67,7 +67,7 @@ def main() -> None:
     scene = obstacle_scene(options.spacing)
     scheme = preset("weakly_compressible", **(IMPACT_OPTIONS | {"sound_speed": 10.0 * scene.reference_speed}))
     run = obstacle_run(Simulator(scene, scheme))
-    figure, axes = pyplot.subplots(4, 1, figsize=(9, 11))
+    figure, axes = pyplot.subplots(4, 1, figsize=(9, 11), layout="constrained")
     cpu, parts = time.process_time(), []
     for axis, stop in zip(axes, [t for t in SECTION_TIMES if t < options.until], strict=False):
         parts.append(obstacle_pressures(run, stop))
@@ -85,7 +85,7 @@ def main() -> None:
             axis.plot(at * math.sqrt(DEPTH / GRAVITY), measured, "k.-", label="Kleefsman et al. 2005")
         axis.set(xlim=(0, options.until), ylim=(-0.1, 3), ylabel=f"{probe}: p / (rho g H)", xlabel="t / s")
         axis.legend()
-    figure.savefig(options.picture, dpi=90, bbox_inches="tight")
+    figure.savefig(options.picture, dpi=90)
     print(
         f"{run.particles.count} particles, {int(run.record.steps)} steps, {cpu:.0f} CPU seconds, "
         f"{int(run.record.outside.sum())} outside; picture: {options.picture}"

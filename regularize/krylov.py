@@ -46,12 +46,12 @@ def lsqr(
     above ``tolerance``.
     """
     options = {"damping": damping, "tolerance": tolerance, "max_iterations": max_iterations, "strict": strict}
-    return iterate("lsqr", _bidiagonalise, matvec, rmatvec, b, weight, **options)
+    return iterate("lsqr", _run, matvec, rmatvec, b, weight, **options)
 
 
 def iterate(
     name: str,
-    run: Callable[..., tuple[torch.Tensor, int]],
+    run: "Callable[[GolubKahan, float, int], tuple[torch.Tensor, int]]",
     matvec: Apply,
     rmatvec: Apply,
     b: torch.Tensor,
@@ -75,16 +75,8 @@ def iterate(
     done, true, reason = 0, 1.0, "iteration limit"
     while done < max_iterations:
         residual, before = w64 * (b64 - matvec(x)), true
-        step, used = run(
-            lambda v: w * matvec(v),
-            lambda u: rmatvec(w * u),
-            residual,
-            x,
-            damping,
-            tolerance * scale,
-            max_iterations - done,
-            b.dtype,
-        )
+        process = GolubKahan(lambda v: w * matvec(v), lambda u: rmatvec(w * u), residual, x, damping, b.dtype)
+        step, used = run(process, tolerance * scale, max_iterations - done) if process.alpha else (0.0, 0)
         x = x + step
         done += max(used, 1)
         true = float((rmatvec(w64 * (w64 * (b64 - matvec(x)))) - damping**2 * x).norm()) / scale
@@ -103,51 +95,55 @@ def iterate(
     return solution
 
 
-def _bidiagonalise(
-    matvec: Apply,
-    rmatvec: Apply,
-    residual: torch.Tensor,
-    x0: torch.Tensor,
-    damping: float,
-    aim: float,
-    limit: int,
-    dtype: torch.dtype,
-) -> tuple[torch.Tensor, int]:
-    """One LSQR run for the correction of x0, in ``dtype``; stops when the estimated gradient is below aim.
+class GolubKahan:
+    """Golub and Kahan's bidiagonalisation for the correction of x0, in ``dtype``: alpha, beta and v of each step.
 
-    With damping, the rows [damping I] have the residual -damping x0, carried as a second part of u.
+    Damping is rows: [damping I] has the residual -damping x0, carried as a second part ``low`` of u.
     """
-    u, low = residual.to(dtype), (-damping * x0).to(dtype)
-    beta = norm_of(u, low)
-    u, low = u / beta, low / beta
-    v = rmatvec(u) + damping * low
-    alpha = float(v.norm())
-    if alpha == 0:
-        return torch.zeros_like(x0), 0
-    v = v / alpha
-    w, x = v.clone(), torch.zeros_like(v)
-    phi_bar, rho_bar = beta, alpha
+
+    def __init__(
+        self,
+        matvec: Apply,
+        rmatvec: Apply,
+        residual: torch.Tensor,
+        x0: torch.Tensor,
+        damping: float,
+        dtype: torch.dtype,
+    ) -> None:
+        self.matvec, self.rmatvec, self.damping = matvec, rmatvec, damping
+        self.u, self.low = residual.to(dtype), (-damping * x0).to(dtype)
+        self.v, self.alpha = torch.zeros_like(self.low), 0.0
+        self._normalise()
+
+    def step(self) -> None:
+        """The next alpha, beta, u and v; alpha or beta is 0 where the process has ended."""
+        self.u, self.low = self.matvec(self.v) - self.alpha * self.u, self.damping * self.v - self.alpha * self.low
+        self._normalise()
+
+    def _normalise(self) -> None:
+        # summed in float64 whatever the precision of the parts
+        self.beta = float((self.u.double().square().sum() + self.low.double().square().sum()).sqrt())
+        if self.beta > 0:
+            self.u, self.low = self.u / self.beta, self.low / self.beta
+        v = self.rmatvec(self.u) + self.damping * self.low - self.beta * self.v
+        self.alpha = float(v.norm())
+        self.v = v / self.alpha if self.alpha > 0 else v
+
+
+def _run(process: GolubKahan, aim: float, limit: int) -> tuple[torch.Tensor, int]:
+    """One LSQR run; stops when the estimated gradient is below aim."""
+    w, x = process.v.clone(), torch.zeros_like(process.v)
+    phi_bar, rho_bar = process.beta, process.alpha
     count = 0
     while count < limit:
         count += 1
-        u, low = matvec(v) - alpha * u, damping * v - alpha * low
-        beta = norm_of(u, low)
-        if beta > 0:
-            u, low = u / beta, low / beta
-        v = rmatvec(u) + damping * low - beta * v
-        alpha = float(v.norm())
-        v = v / alpha if alpha > 0 else v
-        rho = (rho_bar**2 + beta**2) ** 0.5
-        cosine, sine = rho_bar / rho, beta / rho
-        theta, rho_bar = sine * alpha, -cosine * alpha
+        process.step()
+        rho = (rho_bar**2 + process.beta**2) ** 0.5
+        cosine, sine = rho_bar / rho, process.beta / rho
+        theta, rho_bar = sine * process.alpha, -cosine * process.alpha
         phi, phi_bar = cosine * phi_bar, sine * phi_bar
         x = x + (phi / rho) * w
-        w = v - (theta / rho) * w
-        if abs(alpha * sine * phi) <= 0.9 * aim or alpha == 0 or beta == 0:
+        w = process.v - (theta / rho) * w
+        if abs(process.alpha * sine * phi) <= 0.9 * aim or process.alpha == 0 or process.beta == 0:
             break
     return x.double(), count
-
-
-def norm_of(u: torch.Tensor, low: torch.Tensor) -> float:
-    """Norm of the stacked vector (u, low): the two parts' hypotenuse, summed in float64 whatever their precision."""
-    return float((u.double().square().sum() + low.double().square().sum()).sqrt())

@@ -5,7 +5,7 @@ D. Fong and M. Saunders, SIAM J. Sci. Comput. 33 (2011) 2950. Stopping and weigh
 
 import torch
 
-from .krylov import Apply, Solution, iterate, norm_of
+from .krylov import Apply, GolubKahan, Solution, iterate
 
 
 def lsmr(
@@ -24,39 +24,16 @@ def lsmr(
     return iterate("lsmr", _run, matvec, rmatvec, b, weight, **options)
 
 
-def _run(
-    matvec: Apply,
-    rmatvec: Apply,
-    residual: torch.Tensor,
-    x0: torch.Tensor,
-    damping: float,
-    aim: float,
-    limit: int,
-    dtype: torch.dtype,
-) -> tuple[torch.Tensor, int]:
-    """One run for the correction of x0; names as in the paper's section 5. Damping is rows, as in LSQR."""
-    u, low = residual.to(dtype), (-damping * x0).to(dtype)
-    beta = norm_of(u, low)
-    if beta == 0:
-        return torch.zeros_like(x0), 0
-    u, low = u / beta, low / beta
-    v = rmatvec(u) + damping * low
-    alpha = float(v.norm())
-    if alpha == 0:
-        return torch.zeros_like(x0), 0
-    v = v / alpha
+def _run(process: GolubKahan, aim: float, limit: int) -> tuple[torch.Tensor, int]:
+    """One run; names as in the paper's section 5. Damping is rows, as in LSQR."""
+    v, alpha, beta = process.v, process.alpha, process.beta
     zeta_bar, alpha_bar, rho, rho_bar, c_bar, s_bar = alpha * beta, alpha, 1.0, 1.0, 1.0, 0.0
     h, h_bar, x = v.clone(), torch.zeros_like(v), torch.zeros_like(v)
     count = 0
     while count < limit:
         count += 1
-        u, low = matvec(v) - alpha * u, damping * v - alpha * low
-        beta = norm_of(u, low)
-        if beta > 0:
-            u, low = u / beta, low / beta
-        v = rmatvec(u) + damping * low - beta * v
-        alpha = float(v.norm())
-        v = v / alpha if alpha > 0 else v
+        process.step()
+        v, alpha, beta = process.v, process.alpha, process.beta
         rho_old, rho = rho, (alpha_bar**2 + beta**2) ** 0.5
         c, s = alpha_bar / rho, beta / rho
         theta, alpha_bar = s * alpha, c * alpha

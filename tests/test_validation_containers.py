@@ -40,7 +40,7 @@ def settled(name, across, time, **changes):
 
 @pytest.mark.parametrize("name", ["sphere", "tilted box"])
 def test_hydrostatic_pressure_at_12_across(name):
-    """The issue asks for 1.5 % and 1 %; measured 0.9 and 0.4 % in the sphere, 0.6 and 0.6 % in the box."""
-    pressure, speed = settled(name, 12, 2.0)
+    """The issue asks for 1.5 % and 1 %; measured 0.9 and 0.5 % in the sphere, 0.7 and 0.7 % in the box."""
+    pressure, speed = settled(name, 12, 1.2)
     assert pressure < 0.011
     assert speed < 0.009

@@ -16,7 +16,7 @@ from torchsph.dam_breaks import (
     obstacle_pressures,
     obstacle_run,
     obstacle_scene,
-)  # fmt: skip
+)
 
 EXPERIMENTS = Path(__file__).resolve().parents[2] / "shared" / "data" / "experiments"
 # the digitised times are in sqrt(H / g): the wave then meets P1 at 0.39 s, within the 0.4 to 0.5 s of the paper's

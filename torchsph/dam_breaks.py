@@ -57,9 +57,11 @@ def obstacle_scene(spacing: float) -> Scene:
     depth = 2 * spacing
     lower, upper = np.array(OBSTACLE[0]) - (0.0, 0.0, depth), np.array(OBSTACLE[1])
     block = geometry.box(lower, upper, 2 * spacing)
+    # its top comes first: a surface's check asks for the first vertex of a piece whether the piece lies in another
+    inward = block.faces[np.argsort(-block.vertices[block.faces, 2].mean(1), kind="stable"), ::-1]
     walls = geometry.Surface(
         np.concatenate([tank.vertices, block.vertices]),
-        np.concatenate([tank.faces, block.faces[:, ::-1] + len(tank.vertices)]),
+        np.concatenate([tank.faces, inward + len(tank.vertices)]),
     )
     return Scene(
         spacing=spacing, fluid=Fluid(1000.0, 0.001), gravity=(0.0, 0.0, -GRAVITY),

@@ -10,7 +10,8 @@ from torch import Tensor
 from .pairs import backend as choose_backend
 from .pairs.interface import Support
 from .particles import FLUID, Particles
-from .simulator import Simulation, Simulator
+from .simulation import Simulation
+from .simulator import Simulator
 from .smoothing import kernel
 from .terms import tait_pressure
 

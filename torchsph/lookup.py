@@ -36,6 +36,7 @@ class LookUp:
         self._counts = grid.shape[::-1]
         self._origin = [value / unit for value in grid.origin]
         self._step = [value / unit for value in grid.spacing]
+        self._place = [early.new_tensor(values) for values in (self._origin, self._step, [n - 2 for n in self._counts])]
 
     def at(self, points: Tensor, fraction: Tensor) -> Tensor:
         """Values (N, C) at points (N, D), ``fraction`` (N,) or () of the way from early to late.
@@ -67,9 +68,10 @@ class LookUp:
     def _by_torch(self, points: Tensor, fraction: Tensor) -> Tensor:
         if self._both is None:
             self._both = self._rows[0] if self.steady else torch.cat(self._rows, 1)
-        place = (points - points.new_tensor(self._origin)) / points.new_tensor(self._step)
+        origin, step, last = self._place
+        place = (points - origin) / step
         finite = torch.nan_to_num(place, nan=0.0, posinf=0.0, neginf=0.0)
-        low = torch.minimum(finite.floor().clamp_min(0.0), points.new_tensor(self._counts) - 2.0)
+        low = torch.minimum(finite.floor().clamp_min(0.0), last)
         share = (place - low).clamp(0.0, 1.0)
         node = low[:, 0].to(torch.int64)
         strides = [1]

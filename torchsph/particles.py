@@ -95,7 +95,10 @@ class Particles:
         They stand where they stood if they are as many, else behind the others, whose order stays.
         """
         old = torch.nonzero(self.member == member).flatten()
-        new = torch.nonzero(other.member == member).flatten() + self.count
+        new = torch.nonzero(other.member == member).flatten()
+        if self.label is not None and other.label is not None:  # each particle back into its own row
+            old, new = old[torch.argsort(self.label[old])], new[torch.argsort(other.label[new])]
+        new = new + self.count
         rows = torch.arange(self.count, device=self.member.device)
         if len(old) == len(new):
             rows[old] = new

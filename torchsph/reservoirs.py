@@ -64,11 +64,9 @@ class Reservoirs:
         return times, rate, np.array([self.motion.volume(t) for t in times]) / unit
 
     def _looked_up(self, table: np.ndarray, times: Tensor) -> Tensor:
-        period = self.motion.period
-        places = times.cpu().numpy()
-        if period:
-            places = self.times[0] + np.mod(places - self.times[0], period)
-        return torch.as_tensor(np.interp(places, self.times, table), dtype=self.domain.dtype, device=self.domain.device)
+        wrapped = [self.domain.walls.moments.wrapped(time) for time in times.tolist()]
+        value = np.interp(wrapped, self.times, table)
+        return torch.as_tensor(value, dtype=self.domain.dtype, device=self.domain.device)
 
     def inflow(self, times: Tensor) -> Tensor:
         """dV/dt at times (s), internal: what has to enter through the open valves together."""
@@ -82,7 +80,8 @@ class Reservoirs:
         part = particles.inside.to(particles.mass.dtype)
         for _, frame in self._active():
             height = frame.height(particles.position)
-            near = (height.abs() < 0.5) & ((particles.position - frame.centre).square().sum(1) < (frame.radius + 1.0) ** 2)
+            away = (particles.position - frame.centre).square().sum(1)
+            near = (height.abs() < 0.5) & (away < (frame.radius + 1.0) ** 2)
             part = torch.where(near, 0.5 - height, part)
         return self._looked_up(self.volume, times) - particles.per_member(part * particles.mass, "sum")
 

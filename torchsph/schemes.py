@@ -60,6 +60,8 @@ class GammaRamp:
 class Rollback:
     """A member that fails goes back to its last good state and tries again with steps half as long.
 
+    The others wait meanwhile; a search of neighbours that its way back calls for may change them by round-off.
+
     Attributes:
         tries: how often from one state, each time with steps half as long again; then the member is frozen there.
         every: steps between the states that are kept; one is kept at the start of each imposed interval as well.

@@ -151,7 +151,8 @@ class Simulation:
                 None if checkpoints is None else checkpoints.factor,
             )
             self.domain.at(self.time + done * self.units.time)
-            self._refresh_neighbours()
+            self._pass_valves()
+            self._sort_when_due()
             done = self._take_step(step, done, checkpoints)
 
     def _ramp(self, done: Tensor) -> None:
@@ -166,18 +167,20 @@ class Simulation:
         if ramped is not self._stepper.coefficients:
             self._stepper.use(ramped)
 
-    def _refresh_neighbours(self) -> None:
-        """Where the neighbour list is used up: pass particles through valves, and now and then sort them in space."""
-        search = self._stepper.pair_search
-        if not search.stale(self.particles):
-            return
+    def _pass_valves(self) -> None:
+        """Particles that have crossed an open valve change sides, in every step: the flow must not feel the search."""
         before = self.particles.count
         self.particles, renumbered = self.domain.exchange(self.particles, self.record)
         if renumbered:
             self._forget_pairs()
         if self.particles.count != before:
             self._acceleration = torch.zeros_like(self.particles.position)
-        if self.particles.count >= _SORT_FROM and search.searches >= self._sort_at:
+
+    def _sort_when_due(self) -> None:
+        """Now and then, where the neighbours are to be searched anyway, sort large sets in space."""
+        search = self._stepper.pair_search
+        due = self.particles.count >= _SORT_FROM and search.searches >= self._sort_at
+        if due and search.stale(self.particles):
             self._sort(search.spatial_order(self.particles))
             self._sort_at = search.searches + _SORT_EVERY
 

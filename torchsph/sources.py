@@ -47,8 +47,7 @@ class Sources:
     def strength(self, time: float) -> float:
         """d^2 V / dt^2 of the cavity (m^3/s^2), by central differences of the exact dV/dt over a millisecond."""
         step = 1e-3
-        first, last = float(self.motion.time[0]), float(self.motion.time[-1])
-        early, late = max(time - step, first), min(time + step, last)
+        early, late = self._known(time - step), self._known(time + step)
         if late <= early:
             return 0.0
         return (self.motion.volume_rate(late) - self.motion.volume_rate(early)) / (late - early)
@@ -85,5 +84,10 @@ class Sources:
     def _at(self, region: int, time: float, which: int) -> Tensor:
         """Centre (which 0, internal) or outward normal (1) of an orifice, linear in time between key frames."""
         track = self._track[region][which]
-        row = np.array([np.interp(time, self.motion.time, track[:, k]) for k in range(track.shape[1])])
+        key, place, _ = self.motion.locate(self._known(time))
+        row = track[key] if place == 0 else (1 - place) * track[key] + place * track[key + 1]
         return torch.as_tensor(row, dtype=self.dtype, device=self.device)
+
+    def _known(self, time: float) -> float:
+        """A time (s) at which the motion is known: the same with a period, else the nearest one."""
+        return time if self.motion.period else min(max(time, float(self.motion.time[0])), float(self.motion.time[-1]))

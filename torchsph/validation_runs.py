@@ -28,7 +28,7 @@ _FETCH_RADIUS = 2.0
 
 def taylor_green(
     resolution: int, reynolds: float = 100.0, *, dimension: int = 2, scheme: WeaklyCompressible | None = None,
-    backend: str = "auto",
+    backend: str = "auto", seeding: Seeding = _LATTICE,
 ) -> Simulation:
     """A Taylor-Green vortex on resolution^dimension particles at its start: velocity and pressure as they should be.
 
@@ -43,7 +43,7 @@ def taylor_green(
     scene = Scene(
         spacing=side / resolution, fluid=Fluid(1.0, 1 / reynolds), period=(side,) * dimension, dimension=dimension
     )
-    run = Simulator(scene, scheme, backend=backend, seeding=_LATTICE).start(0.0)
+    run = Simulator(scene, scheme, backend=backend, seeding=seeding).start(0.0)
     points = run.particles.position * scene.spacing
     if plane:
         velocity = validation.taylor_green_2d(points, 0.0, 1 / reynolds)

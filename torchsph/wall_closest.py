@@ -22,7 +22,8 @@ def closest_on_grid(
     Exact (for the faces as they are) where the distance is below ``limit`` (n,), m; farther away the closest point of
     a node that is, so that the distance is a bound from above. A node spacing has to be the same along all axes.
 
-    Measured (5,112 faces, 260,288 nodes of 0.5 mm, one core): 0.08 s compiled, 0.47 s by the k-d tree.
+    Measured on one core, 263,424 nodes: 6,394 faces 0.10 s compiled and 0.57 s by the k-d tree, 160,636 faces 0.7 and
+    1.4 s.
     """
     try:
         handle = library().handle

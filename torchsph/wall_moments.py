@@ -59,6 +59,10 @@ class Moments:
                 found += [t - beat * period for t in self.times if t < first + period]
         return sorted({t for t in found if start <= t <= stop})
 
+    def wrapped(self, time: float) -> float:
+        """The time (s) among the key frames that ``time`` stands for, by the motion's period."""
+        return time - self._shift(time)
+
     def _shift(self, time: float) -> float:
         first, last, period = self.times[0], self.times[-1], self.motion.period
         if not period or first <= time <= last:

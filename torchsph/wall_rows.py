@@ -29,6 +29,10 @@ def wall_rows(
 ) -> WallRows:
     """One row per wall face at a frame, weighted by area; an open orifice carries the flux dV/dt as a plug.
 
+    The rows are the midpoint rule over the faces: enough, and exact in the flux, while faces are smaller than the
+    knots. A coarser surface is refined first (``geometry.refined_motion``); points gathered evenly over a finer one
+    (``geometry.WallSampler``) would save rows, which cost next to nothing, and lose the faces' exact areas and normals.
+
     ``at_rest``: every velocity zero, the rows of an increment between two fields that both obey the walls.
     """
     time = float(recording.time[frame])

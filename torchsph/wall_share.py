@@ -10,6 +10,9 @@ from torch.nn import functional
 
 from .smoothing import SmoothingKernel
 
+# the slope of the distance is 1 but for nodes whose neighbours are nearest to different walls
+_PLAIN = 0.97
+
 
 class KernelShare:
     """Integral of the kernel over the fluid, and its gradient, at every node of a grid.
@@ -48,9 +51,14 @@ class KernelShare:
 
         Args:
             speed: (*shape) of the nearest wall point along ``normal`` (D, *shape), which points into the fluid.
+
+        Within 1 % in total; smeared a little wider than the share's gradient, by up to 7 % of the peak.
+        Nodes that lie between two walls at an edge are left out: their normal belongs to neither of them.
         """
         slope = torch.stack(torch.gradient(self._indicator(distance))[::-1]) / self.step
-        return self._back(self._spectrum(speed * (normal * slope).sum(0)) * self._transforms[0])[None]
+        plain = torch.stack(torch.gradient(distance)).norm(dim=0) > _PLAIN * self.step
+        flux = torch.where(plain, speed * (normal * slope).sum(0), torch.zeros_like(speed))
+        return self._back(self._spectrum(flux) * self._transforms[0])[None]
 
     def _indicator(self, distance: Tensor) -> Tensor:
         return (0.5 + distance.to(self.dtype) / self.step).clamp(0.0, 1.0)

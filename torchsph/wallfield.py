@@ -38,12 +38,15 @@ class WallFields:
         kernel, smoothing_length: of the pair sums, internal length; the margin around the walls follows from them.
         complete: whether the kernel's share and its gradient are wanted.
         sliding: whether what the walls sweep is wanted as well (``CompleteKernelWall.sliding``).
+
+    Raises geometry.SurfaceError for walls that are open or inside out.
     """
 
     def __init__(
         self, motion: WallMotion, spacing: float, speed: float, kernel: SmoothingKernel, smoothing_length: float,
         complete: bool, device: str | torch.device, dtype: torch.dtype, *, sliding: bool = False,
     ) -> None:
+        motion.surface(float(motion.time[0])).check()
         self.motion, self.spacing, self.speed = motion, spacing, speed
         self.device, self.dtype = device, dtype
         self.moments = Moments(motion, spacing)

@@ -44,6 +44,36 @@ struct Place {
   }
 };
 
+// The weighted rows of a cell's corners; `wide` channels are summed, so that the loops have a length known beforehand.
+template <class Real, int D, int wide>
+void gather(const Place<Real, D>& place, const int64_t* offset, int64_t channels, const Real* early, const Real* late,
+            Real after, Real* out) {
+  Real sum[wide] = {};
+  for (int c = 0; c < 1 << D; ++c) {
+    Real weight = 1;
+    for (int k = 0; k < D; ++k) weight *= c >> k & 1 ? place.share[k] : 1 - place.share[k];
+    const Real* row = early + (place.node + offset[c]) * channels;
+    const Real before = weight * (1 - after);
+    for (int i = 0; i < wide; ++i) sum[i] += before * row[i];
+    if (!late) continue;
+    row = late + (place.node + offset[c]) * channels;
+    for (int i = 0; i < wide; ++i) sum[i] += weight * after * row[i];
+  }
+  std::copy(sum, sum + std::min<int64_t>(wide, channels), out);
+}
+
+template <class Real, int D>
+void gather(const Place<Real, D>& place, const int64_t* offset, int64_t channels, int64_t room, const Real* early,
+            const Real* late, Real after, Real* out) {
+  // sums over more channels than there are read into the next row, which the last rows do not have
+  if (channels > 8 && channels <= 12 && room >= 12)
+    return gather<Real, D, 12>(place, offset, channels, early, late, after, out);
+  if (channels > 4 && channels <= 8 && room >= 8)
+    return gather<Real, D, 8>(place, offset, channels, early, late, after, out);
+  for (int64_t i = 0; i < channels; ++i)
+    gather<Real, D, 1>(place, offset, channels, early + i, late ? late + i : nullptr, after, out + i);
+}
+
 template <class Real, int D>
 void look_up(const sph_look_up& a) {
   constexpr int64_t corners = 1 << D, block = 16;
@@ -51,6 +81,8 @@ void look_up(const sph_look_up& a) {
   const auto *early = static_cast<const Real*>(a.early), *late = static_cast<const Real*>(a.late);
   const auto *points = static_cast<const Real*>(a.points), *fractions = static_cast<const Real*>(a.fraction);
   Real* out = static_cast<Real*>(a.out);
+  int64_t nodes = 1;
+  for (int k = 0; k < D; ++k) nodes *= a.counts[k];
   int64_t offset[corners];  // of the corners of a cell, in nodes
   for (int64_t c = 0; c < corners; ++c) {
     int64_t stride = 1;
@@ -87,17 +119,9 @@ void look_up(const sph_look_up& a) {
         std::copy(early + place.node * channels, early + (place.node + 1) * channels, sum);
         continue;
       }
-      std::fill(sum, sum + channels, Real(0));
       const Real after = late ? fractions[a.fractions == 1 ? 0 : n] : Real(0);
-      for (int64_t c = 0; c < corners; ++c) {
-        Real weight = 1;
-        for (int k = 0; k < D; ++k) weight *= c >> k & 1 ? place.share[k] : 1 - place.share[k];
-        const int64_t at = (place.node + offset[c]) * channels;
-        const Real before = late ? weight * (1 - after) : weight;
-        for (int64_t i = 0; i < channels; ++i) sum[i] += before * early[at + i];
-        if (late)
-          for (int64_t i = 0; i < channels; ++i) sum[i] += weight * after * late[at + i];
-      }
+      const int64_t room = (nodes - place.node - offset[corners - 1]) * channels;
+      gather<Real, D>(place, offset, channels, room, early, late, after, sum);
     }
   }
 }
