@@ -12,8 +12,8 @@ from torchsph.free_surface import resting_block
 from torchsph.validation import FREE_SURFACE_OPTIONS
 
 WATER = 0.001
-# what an artificial viscosity of alpha = 0.1 amounts to at a twentieth of the column: alpha h c rho / 8 (Monaghan 2005
-# eq. 8.8), here as one that the bed feels as well
+# what an artificial viscosity of alpha = 0.1 amounts to at a twentieth of the column, alpha h c rho / 8 (Monaghan
+# 2005), but one that the bed feels as well
 NUMERICAL = 25.0
 
 

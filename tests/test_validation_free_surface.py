@@ -18,7 +18,7 @@ SOUND = 10.0
 
 
 def patch_pressure(x, y):
-    """p / (rho omega^2 L^2) of a square patch [-1/2, 1/2]^2 that begins to rotate (Le Touze et al. 2013 eq. 34)."""
+    """p / (rho omega^2 L^2) of a square patch [-1/2, 1/2]^2 that begins to rotate (Le Touze et al. 2013)."""
     odd = np.arange(1, 80, 2) * np.pi
     m, n = odd[:, None], odd[None, :]
     modes = -32.0 / (m * n * (m * m + n * n))

@@ -60,9 +60,11 @@ def test_the_obstacle_stands_in_the_tank():
 def test_dam_break_on_an_obstacle():
     """Measured at 0.04 m (10850 particles, 4 to the obstacle's height), means over 20 ms, from 0.3 to 1.45 s.
 
-    The wave arrives 29 ms (P1) and 35 ms (P3) late: a probe is wet when the first particle's centre is near. Impulse
-    16 % too high at P1 and 28 % too low at P3, RMS difference 0.34 and 0.24 rho g H, peak at P1 1.76 against 2.01: what
-    limits all of them is the spacing. (At 0.025 m, before: 24 and 59 ms, 28 % and -31 %, peaks 2.24 and 1.08 of 1.20.)
+    The wave arrives 29 ms (P1) and 35 ms (P3) late. Impulse 16 % too high at P1 and 28 % too low at P3, RMS difference
+    0.34 and 0.24 rho g H, peak 1.76 against 2.01 at P1 and 0.66 against 1.20 at P3 (not asserted). At 0.025 m, with the
+    walls of an earlier day: 32 and 59 ms late, impulses 28 % high and 31 % low: more particles alone are no cure.
+    ``IMPACT_OPTIONS``, the probes without tension and the mean over 20 ms were chosen on this very experiment: these
+    figures are a fit's, and no prediction.
     """
     scene = obstacle_scene(0.04)
     options = IMPACT_OPTIONS | {"sound_speed": 10.0 * scene.reference_speed}

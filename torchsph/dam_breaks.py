@@ -32,7 +32,7 @@ OBSTACLE_TANK = ((0.0, -0.5, 0.0), (3.22, 0.5, 1.0))
 OBSTACLE_COLUMN = ((0.0, -0.5, 0.0), (1.228, 0.5, 0.55))
 OBSTACLE = ((2.42, -0.2, 0.0), (2.58, 0.2, 0.161))
 OBSTACLE_PROBES = ((2.42, 0.0, 0.021), (2.42, 0.0, 0.101))
-# Waves that hit walls: without this damping single particles at the obstacle ring with 5 rho g H
+# Waves that hit walls: without this damping single particles at the obstacle ring with 5 rho g H (chosen on P1 and P3)
 IMPACT_OPTIONS = FREE_SURFACE_OPTIONS | {"smoothing_ratio": 1.6, "bulk_damping": 1.0, "artificial_viscosity": 0.1}
 
 

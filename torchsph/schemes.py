@@ -188,7 +188,7 @@ class WeaklyCompressible:
         shifting_speed: the speed in the shifting: "local" (the particle's own) or "largest" (of its member: also
             stagnation points are evened out, which a vortex needs and a jet in a resting chamber does not).
         shifting_surface: h times the crowding gradient above which a particle counts as one of a free surface and is
-            not shifted (Lind et al. 2012 section 3.4 in its simplest form), or None: all are.
+            not shifted, or None: all are.
         tensile: R of Monaghan's tensile correction (2000; 0.2 there, symmetric pressure form only), or None.
         order: "thesis" steps as algorithm 1; "symplectic" evaluates both passes at one position (symplectic Euler);
             "verlet" is the position Verlet scheme, "predictor_corrector" the symplectic predictor-corrector, both of

@@ -39,8 +39,12 @@ import numpy as np
 from pymust import smoothn
 file = np.load(sys.argv[1])
 velocity, weight = file["velocity"], file["weight"]
-out = [smoothn(list(frame), W=w.copy(), isrobust=True)[0] for frame, w in zip(velocity, weight)]
-np.save(sys.argv[2], np.array(out))
+groups = [[0, 1, 2]] if sys.argv[3] == "together" else [[0], [1], [2]]
+out = np.zeros_like(velocity)
+for frame, w, found in zip(velocity, weight, out):
+    for group in groups:
+        found[group] = smoothn([frame[k] for k in group], W=w.copy(), isrobust=True)[0]
+np.save(sys.argv[2], out)
 """
 
 
@@ -52,8 +56,12 @@ def gaussian(velocity: np.ndarray, weight: np.ndarray, spacing: np.ndarray) -> n
     return np.stack([np.where(share > 1e-9, part / np.maximum(share, 1e-9), 0.0) for part in parts])
 
 
-def smoothn(measured: geometry.Recording, frames: list[int], python: str) -> np.ndarray | None:
-    """(frames, D, *shape) from PyMUST in the interpreter ``python``; None, with a message, where it lacks PyMUST."""
+def smoothn(measured: geometry.Recording, frames: list[int], python: str, mode: str) -> np.ndarray | None:
+    """(frames, D, *shape) from PyMUST in the interpreter ``python``; None, with a message, where it lacks PyMUST.
+
+    ``mode`` "together": the components share smoothness and robust weights, as PyMUST has it for vectors; "each": they
+    do not.
+    """
     if subprocess.run([python, "-c", "import pymust"], capture_output=True, check=False).returncode:
         print(f"{python} has no PyMUST: smoothn is left out (pip install pymust, or --pymust PYTHON)", file=sys.stderr)
         return None
@@ -62,7 +70,7 @@ def smoothn(measured: geometry.Recording, frames: list[int], python: str) -> np.
         velocity = np.nan_to_num(measured.velocity[frames]).astype(np.float64)
         weight = np.stack([node_weights(measured, frame).astype(np.float64) ** 2 for frame in frames])
         np.savez(given, velocity=velocity, weight=weight)
-        subprocess.run([python, "-c", PYMUST, str(given), str(found)], check=True, capture_output=True)
+        subprocess.run([python, "-c", PYMUST, str(given), str(found), mode], check=True, capture_output=True)
         return np.load(found)
 
 
@@ -126,8 +134,9 @@ def compare(truth: geometry.Recording, measured: geometry.Recording, every: int,
     start, weight = time.perf_counter(), [node_weights(measured, f).astype(np.float64) for f in frames]
     smooth = [gaussian(measured.velocity[f], w, measured.grid.spacing) for f, w in zip(frames, weight, strict=True)]
     add("Gaussian, 3 mm", np.stack(smooth), start)
-    start = time.perf_counter()
-    add("PyMUST smoothn", smoothn(measured, frames, python), start)
+    for mode in ("together", "each"):
+        start = time.perf_counter()
+        add(f"PyMUST smoothn, {mode}", smoothn(measured, frames, python, mode), start)
     for name, preset in (("spline, thesis preset", "thesis"), ("spline", "default")):
         start, fit = time.perf_counter(), Splines(measured, regularize.Smoother.preset(preset))
         fields = np.stack([fit(frame) for frame in frames])
