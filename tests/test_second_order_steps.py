@@ -17,8 +17,9 @@ def end_state(order, steps, viscosity):
     """Positions and velocities of a slightly disordered vortex after a fixed time in ``steps`` steps."""
     scene = Scene(spacing=1 / 16, fluid=Fluid(1.0, viscosity), period=(1.0, 1.0), dimension=2)
     scheme = preset(
-        "weakly_compressible", order=order, shifting=None, artificial_viscosity=None, bulk_damping=None, density_diffusion=None,
-        sound_speed=5.0, smoothing_ratio=1.5, pressure="sum", courant=5.0, steps_per_frame=steps,
+        "weakly_compressible", order=order, shifting=None, artificial_viscosity=None, bulk_damping=None,
+        density_diffusion=None, sound_speed=5.0, smoothing_ratio=1.5, pressure="sum", courant=5.0,
+        steps_per_frame=steps,
     )  # fmt: skip
     axis = torch.arange(16, dtype=torch.float64) + 0.5
     place = torch.cartesian_prod(axis, axis)

@@ -25,7 +25,8 @@ def block(side=12):
 
 def after_one_step(backend, time=1e-5, **changes):
     options = {"sound_speed": 10.0, "density_diffusion": None} | STILL | changes
-    run = Simulator(OPEN, preset("weakly_compressible", **options), dtype=torch.float64, backend=backend).resume(block(), 0.0)
+    scheme = preset("weakly_compressible", **options)
+    run = Simulator(OPEN, scheme, dtype=torch.float64, backend=backend).resume(block(), 0.0)
     run.advance(time)
     assert int(run.record.steps) == 1
     return float((run.particles.deviation - block().deviation).abs().max())
@@ -80,7 +81,8 @@ def test_hughes_graham_halves_fly_apart_without_being_held_back():
 
 def test_hughes_graham_pressure_is_that_of_the_thesis():
     """2.25 at rho* = max(rho, rho0)."""
-    simulator = Simulator(OPEN, preset("weakly_compressible", gamma=7.0, sound_speed=10.0, hughes_graham=True), dtype=torch.float64)
+    scheme = preset("weakly_compressible", gamma=7.0, sound_speed=10.0, hughes_graham=True)
+    simulator = Simulator(OPEN, scheme, dtype=torch.float64)
     start = block()
     pressure = simulator.resume(start, 0.0)._stepper.pressure(start)
     density = (1 + start.deviation).clamp_min(1.0)

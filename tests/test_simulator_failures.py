@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from torchsph import NumericalFailure, Rollback, Scene, Simulator, preset
+from torchsph import NumericalFailure, Rollback, Scene, Simulator, WeaklyCompressible
 from torchsph.particles import Particles
 from torchsph.scene import Fluid
 from torchsph.terms import LIMITS
@@ -25,7 +25,7 @@ def vortices(speeds, dtype=torch.float64, backend="auto", **changes):
     particles = Particles(position, velocity, 0 * one, one, label, label, 1).repeated(len(speeds))
     factor = torch.tensor(speeds, dtype=dtype)[particles.member]
     particles = particles.changed(velocity=particles.velocity * factor[:, None])
-    scheme = preset("weakly_compressible", **({"sound_speed": 10.0} | changes))
+    scheme = WeaklyCompressible(**({"sound_speed": 10.0} | changes))
     return Simulator(SCENE, scheme, dtype=dtype, backend=backend).resume(particles, 0.0)
 
 

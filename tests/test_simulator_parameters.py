@@ -144,7 +144,7 @@ def test_a_changed_parameter_is_the_scheme_with_that_parameter(name, backend):
 
 def test_changes_that_cannot_be():
     scene = Scene(spacing=1 / 12, period=(1.0, 1.0), dimension=2)
-    run = Simulator(scene).start(0.0, members=2)
+    run = Simulator(scene, preset("weakly_compressible")).start(0.0, members=2)
     with pytest.raises(ValueError, match="unknown parameter 'speed'; known: sound_speed"):
         run.change(speed=1.0)
     with pytest.raises(ValueError, match=r"needs one value, or 2 for the members, got \(3,\)"):
@@ -155,6 +155,8 @@ def test_changes_that_cannot_be():
         run.change(gamma=None)
     with pytest.raises(ValueError, match="'xsph' needs a scheme with XSPH"):
         run.change(xsph=0.1)
+    with pytest.raises(ValueError, match="of the incompressible scheme only shifting, courant, viscosity can change"):
+        Simulator(scene).start(0.0).change(sound_speed=1.0)
     with pytest.raises(ValueError, match="GammaRamp needs positive start and duration"):
         GammaRamp(0.0)
     with pytest.raises(ValueError, match="XSPH form must be"):

@@ -33,7 +33,8 @@ def ghia(component, reynolds):
 
 def cavity_errors(across, reynolds, time, **changes):
     """RMS errors of u and v along the centre lines over the lid's speed, means of the last 2 s; and the run."""
-    run = lid_driven_cavity(across, reynolds, scheme=preset("weakly_compressible", **(validation.CAVITY_OPTIONS | changes)))
+    scheme = preset("weakly_compressible", **(validation.CAVITY_OPTIONS | changes))
+    run = lid_driven_cavity(across, reynolds, scheme=scheme)
     (y, u), (x, v) = ghia("u", reynolds), ghia("v", reynolds)
     points = np.concatenate([np.stack([np.full_like(y, 0.5), y], 1), np.stack([x, np.full_like(x, 0.5)], 1)])
     late = np.linspace(time - 2.0, time, 5)

@@ -56,7 +56,7 @@ def kicked(vertices, phase):
     return moved
 
 
-def run_with(surface, move, dtype, turns=1.0, frames=13):
+def run_with(surface, move, dtype, turns=1.0, frames=13, scheme="weakly_compressible"):
     """A run through ``turns`` of a motion whose fastest vertex moves with 0.3 of the sound speed."""
     phase = np.linspace(0, 2 * np.pi * turns, frames)
     fine = np.linspace(0, 2 * np.pi * turns, 721)
@@ -68,7 +68,7 @@ def run_with(surface, move, dtype, turns=1.0, frames=13):
     rates = np.stack([rate * (move(surface.vertices, p + step) - move(surface.vertices, p)) / step for p in phase])
     motion = geometry.WallMotion.through(phase / rate, places, surface.faces, surface.region, rates=rates)
     scene = Scene(spacing=SPACING, walls=motion, dimension=surface.dimension)
-    run = Simulator(scene, dtype=dtype).start(0.0)
+    run = Simulator(scene, preset(scheme), dtype=dtype).start(0.0)
     for time in motion.time[1:]:
         run.advance(float(time))
         assert_nothing_went_wrong(run)
@@ -77,12 +77,16 @@ def run_with(surface, move, dtype, turns=1.0, frames=13):
     return run
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize(
+    ("scheme", "dtype"),
+    [("weakly_compressible", torch.float32), ("weakly_compressible", torch.float64), ("default", torch.float32)],
+)
 @pytest.mark.parametrize("move", [shaken, squeezed, kicked])
 @pytest.mark.parametrize("name", list(SHAPES))
-def test_nothing_leaks_in_a_plane(name, move, dtype):
-    run = run_with(geometry.polygon(outline(name), SPACING), move, dtype, turns=0.5)
-    assert float(run.record.largest_mach.max()) > 0.2  # the fluid did go along
+def test_nothing_leaks_in_a_plane(name, move, scheme, dtype):
+    run = run_with(geometry.polygon(outline(name), SPACING), move, dtype, turns=0.5, scheme=scheme)
+    if scheme == "weakly_compressible":
+        assert float(run.record.largest_mach.max()) > 0.2  # the fluid did go along
 
 
 @pytest.mark.parametrize("name", ["30 degrees", "gap of 3"])

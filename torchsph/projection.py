@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -61,7 +61,7 @@ class Neighbourhood:
     def excess(self, filling: Tensor, counted: Tensor) -> Tensor:
         """Filling relative to the mean of the member's particles whose kernel is cut alike by walls, less 1: (N,).
 
-        At walls particles stand in layers, where the sum is off by percents all the time: against a common mean that
+        At walls particles stand in layers, where the sum is off by percents all the time: against one mean for all it
         would be a source that never ends, and drive a flow along the walls. It is 0 where not ``counted`` (N,) bool, and
         has no mean, so that it takes no part in what flows through a valve.
         """
@@ -95,10 +95,25 @@ class Neighbourhood:
             p.member, p.members,
         )
         found = solve(problem, source * self.share, start, tolerance=tolerance, iterations=iterations)
+        if self.wall is not None:
+            part = problem.total(torch.where(fluid, p.mass * self.share, torch.zeros_like(source)))
+            whole = problem.total(torch.where(fluid, p.mass, torch.zeros_like(source)))
+            found = replace(found, mismatch=found.mismatch * whole / part.clamp_min(_TINY))
         terms = MomentumTerms(pressure="difference")
         slope = backend.momentum(self.pairs, p.state(self._continued(found.values)), self.support, terms)
         slope = slope / self.share[:, None] if self.wall is not None else slope
-        return torch.where(fluid[:, None], slope, torch.zeros_like(slope)), found
+        slope = torch.where(fluid[:, None], slope, torch.zeros_like(slope))
+        return (slope if self.wall is not None else self._without_thrust(slope)), found
+
+    def _without_thrust(self, push: Tensor) -> Tensor:
+        """``push`` (N, D) without its mean: pressure inside a fluid that touches nothing cannot move it as a whole.
+
+        The gradient by differences is exact for linear pressures but, unlike the symmetric one, not antisymmetric.
+        """
+        p = self.particles
+        mass = p.per_member(p.mass, "sum").clamp_min(_TINY)
+        thrust = push.new_zeros((p.members, push.shape[1])).index_add(0, p.member, p.mass[:, None] * push)
+        return push - (thrust / mass[:, None]).index_select(0, p.member)
 
     def _continued(self, values: Tensor) -> Tensor:
         """Values of the fluid, and in buffers the mean of the fluid around: (N,)."""

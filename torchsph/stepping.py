@@ -34,7 +34,8 @@ class StepControl:
         force = particles.per_member(square_length(acceleration), "amax").sqrt()
         viscosity = 0.0 if c.viscosity is None else c.viscosity
         # of an incompressible fluid no signal but the flow itself limits the step
-        limits = step_limits(speed, force, c.smoothing_length, c.sound_speed or 0.0, viscosity, c.courant).double()
+        sound = 0.0 if c.sound_speed is None else c.sound_speed
+        limits = step_limits(speed, force, c.smoothing_length, sound, viscosity, c.courant).double()
         active = left > 0
         frame = torch.full_like(limits[:1], longest)
         smallest, which = torch.cat([self._floored(limits, c, active), frame]).min(0)
