@@ -49,7 +49,7 @@ def cavity_errors(across, reynolds, time, **changes):
 
 
 def test_reynolds_100():
-    """Within 1 % RMS of the lid's speed (2 % asked for) at 20^2 already."""
+    """Within 1 % RMS of the lid's speed (2 % asked for) at 20^2 already: measured 0.54 and 0.20 % for u and v."""
     u, v, run = cavity_errors(20, 100, 8.0)
     assert max(u, v) < 0.01
     # the mean density is held: rounding of float32 over some thousand steps is all that is left
@@ -57,9 +57,12 @@ def test_reynolds_100():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("across", "reynolds", "time"), [(40, 100, 15.0), (48, 400, 30.0), (48, 1000, 45.0)])
+@pytest.mark.parametrize(("across", "reynolds", "time"), [(40, 100, 15.0), (48, 400, 30.0), (60, 1000, 45.0)])
 def test_ghia(across, reynolds, time):
-    """Within 2 % RMS of the lid's speed; the flow at Re 1000 takes 40 s to become steady."""
+    """Within 2 % RMS of the lid's speed: measured, u and v, 0.4 and 0.4 %, 0.3 and 0.3 %, 1.0 and 0.5 %.
+
+    The flow at Re 1000 takes 40 s to become steady; 48^2 particles are 2.1 and 1.9 % off there.
+    """
     assert max(cavity_errors(across, reynolds, time)[:2]) < 0.02
 
 
