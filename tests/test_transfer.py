@@ -107,3 +107,13 @@ def test_pull_follows_the_gain():
 
 def test_weight_is_one_at_zero_and_vanishes_at_its_radius():
     torch.testing.assert_close(wendland_weight(torch.tensor([0.0, 1.0, 2.0])), torch.tensor([1.0, 0.0, 0.0]))
+
+
+def test_pulling_leaves_what_no_node_reaches_alone():
+    """Also just inside the reach of the last node, where the weights underflow."""
+    grid = Grid(origin=(0.0, 0.0, 0.0), spacing=(1.0, 1.0, 1.0), shape=(4, 4, 4))
+    points = torch.tensor([[1.5, 1.5, 1.5], [4.999999, 1.0, 1.0], [9.0, 9.0, 9.0]])
+    velocity = torch.full((3, 3), 2.0)
+    gain = torch.ones(4, 4, 4)
+    moved = pulled(points, velocity, grid, torch.zeros(3, 4, 4, 4), gain, gain)
+    torch.testing.assert_close(moved, torch.tensor([[0.0] * 3, [2.0] * 3, [2.0] * 3]), atol=1e-6, rtol=0)

@@ -321,7 +321,7 @@ class Simulation:
         p = self.particles
         points = p.position * self.units.length
         moved = pulled(points, p.velocity * self.units.speed, grid, target, gain, weight) / self.units.speed
-        self.particles = p.changed(velocity=torch.where(p.fluid[:, None], moved, p.velocity))
+        self.particles = p.changed(velocity=torch.where(p.inside[:, None], moved, p.velocity))
 
     def fetch(self, grid: Grid, mask: Tensor) -> Fetched:
         """Velocities at the nodes where ``mask`` (*shape): value (members, D, *shape), covered (members, *shape)."""

@@ -21,6 +21,8 @@ from .smoothing import kernel
 # spread's determinant to that of a round spread of the same size, the plain average is taken
 _LEAST_ROUNDNESS = 1e-3
 _CHUNK = 1 << 15
+# summed weight, relative to full coverage, below which nothing is known
+_LEAST_SHARE = 1e-6
 
 
 @dataclass(frozen=True)
@@ -181,8 +183,10 @@ def pulled(
 ) -> Tensor:
     """Velocity (N, D) pulled towards a grid field where it is known; see ``particle_filter``."""
     value, share = impose_at(points, grid, torch.cat([target, gain[None]]), weight)
-    strength = torch.where(share > 0, value[:, -1].clamp(0.0, 1.0), torch.zeros_like(share))
-    return velocity + strength[:, None] * (value[:, :-1] - velocity)
+    # at the very end of a node's reach the weights underflow, and their fit is no number
+    known = (share > _LEAST_SHARE)[:, None]
+    moved = velocity + value[:, -1:].clamp(0.0, 1.0) * (value[:, :-1] - velocity)
+    return torch.where(known, moved, velocity)
 
 
 def fill_beyond(field: Tensor, mask: Tensor, grid: Grid, domain: object, layers: int = 3) -> Tensor:
