@@ -6,8 +6,9 @@ Re 100, one decay time, from a lattice and from one whose particles are displace
 spacing (torchsph: a tenth to either side). PySPH runs its own example (``taylor_green``, double precision, one thread)
 with its own options in the interpreter that is named. Error: relative L2 of the particles' velocities.
 
-Measured at 50^2 with PySPH 1.0b2 (lattice, uneven): torchsph 0.9 and 0.5 %, EDAC 3.7 and 1.5 %, delta-SPH 67 and 19 %
-(nothing keeps its particles even). At 16^2 (--quick) EDAC is as good: 5.4 and 6.4 % against 5.4 and 7.0 %.
+Measured at 50^2 with PySPH 1.0b2 (results/peers_vortex.json; lattice, uneven): torchsph 0.9 and 0.5 % in 1.2 CPU
+seconds, EDAC 3.7 and 1.5 % in 36, delta-SPH 67 and 19 % in 50 (nothing keeps its particles even). At 16^2 (--quick)
+EDAC is as good: 5.4 and 6.4 % against 5.4 and 7.0 %.
 """
 
 from __future__ import annotations
