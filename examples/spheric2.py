@@ -23,7 +23,7 @@ matplotlib.use("Agg")
 import numpy as np
 from matplotlib import pyplot
 
-from torchsph import Simulator, preset
+from torchsph import Simulator, WeaklyCompressible
 from torchsph.dam_breaks import (
     GRAVITY,
     IMPACT_OPTIONS,
@@ -65,7 +65,7 @@ def main() -> None:
     parser.add_argument("--picture", type=Path, default=Path("spheric2.png"), metavar="FILE")
     options = parser.parse_args()
     scene = obstacle_scene(options.spacing)
-    scheme = preset("weakly_compressible", **(IMPACT_OPTIONS | {"sound_speed": 10.0 * scene.reference_speed}))
+    scheme = WeaklyCompressible(**(IMPACT_OPTIONS | {"sound_speed": 10.0 * scene.reference_speed}))
     run = obstacle_run(Simulator(scene, scheme))
     figure, axes = pyplot.subplots(4, 1, figsize=(9, 11), layout="constrained")
     cpu, parts = time.process_time(), []

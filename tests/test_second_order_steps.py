@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchsph import XSPH, Scene, Simulator, preset
+from torchsph import XSPH, Scene, Simulator, WeaklyCompressible
 from torchsph.particles import Particles
 from torchsph.scene import Fluid
 
@@ -16,8 +16,8 @@ STEPS = (32, 64, 128)
 def end_state(order, steps, viscosity):
     """Positions and velocities of a slightly disordered vortex after a fixed time in ``steps`` steps."""
     scene = Scene(spacing=1 / 16, fluid=Fluid(1.0, viscosity), period=(1.0, 1.0), dimension=2)
-    scheme = preset(
-        "weakly_compressible", order=order, shifting=None, artificial_viscosity=None, bulk_damping=None,
+    scheme = WeaklyCompressible(
+        order=order, shifting=None, artificial_viscosity=None, bulk_damping=None,
         density_diffusion=None, sound_speed=5.0, smoothing_ratio=1.5, pressure="sum", courant=5.0,
         steps_per_frame=steps,
     )  # fmt: skip
@@ -53,11 +53,11 @@ def test_order_of_the_steps(order, viscosity, expected):
 
 def test_options_that_would_be_ignored_are_refused():
     with pytest.raises(ValueError, match="tensile must be positive and needs pressure='symmetric'"):
-        preset("weakly_compressible", tensile=0.2)
+        WeaklyCompressible(tensile=0.2)
     with pytest.raises(ValueError, match="belongs to order 'thesis', got order 'verlet'"):
-        preset("weakly_compressible", xsph=XSPH(0.2, "velocity"), order="verlet")
+        WeaklyCompressible(xsph=XSPH(0.2, "velocity"), order="verlet")
     with pytest.raises(ValueError, match="Shepard filter needs order"):
-        preset("weakly_compressible", shepard_period=20, order="verlet")
+        WeaklyCompressible(shepard_period=20, order="verlet")
 
 
 def test_the_softening_of_the_viscous_term_is_compensated():

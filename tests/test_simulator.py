@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import geometry
-from torchsph import Scene, Simulator, preset
+from torchsph import Scene, Simulator, WeaklyCompressible, preset
 from torchsph.particles import Particles
 from torchsph.scene import Fluid, Valve
 from torchsph.schemes import PotentialWall
@@ -26,7 +26,7 @@ def taylor_green(position):
 def started(scene=PERIODIC, members=1, dtype=torch.float64, speeds=(1.0,), seed=0, **changes):
     """A Taylor-Green vortex (Taylor & Green 1937); member b is ``speeds[b]`` times as fast."""
     options = {"sound_speed": 10.0, "bulk_damping": None, "artificial_viscosity": None} | changes
-    run = Simulator(scene, preset("weakly_compressible", **options), dtype=dtype).start(0.0, members=members, seed=seed)
+    run = Simulator(scene, WeaklyCompressible(**options), dtype=dtype).start(0.0, members=members, seed=seed)
     factor = torch.tensor(speeds, dtype=dtype)[run.particles.member]
     field = taylor_green(run.particles.position * scene.spacing) * factor[:, None]
     run.particles = run.particles.changed(velocity=field / run.units.speed)
@@ -155,7 +155,7 @@ def test_bad_scenes_and_options_are_refused():
     with pytest.raises(ValueError, match="unknown preset 'best'; known: default, thesis, weakly_compressible"):
         preset("best")
     with pytest.raises(ValueError, match="WeaklyCompressible.pressure must be one of"):
-        preset("weakly_compressible", pressure="odd")
+        WeaklyCompressible(pressure="odd")
     with pytest.raises(ValueError, match="unknown backend 'fast'"):
         Simulator(PERIODIC, backend="fast")
     with pytest.raises(ValueError, match="cannot advance backwards"):

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 import geometry
-from torchsph import XSPH, PotentialWall, Scene, Simulator, preset
+from torchsph import XSPH, PotentialWall, Scene, Simulator, WeaklyCompressible
 from torchsph.particles import Particles
 from torchsph.scene import Fluid
 from torchsph.smoothing import kernel
@@ -17,7 +17,7 @@ EVERYWHERE = torch.ones(17, 17, dtype=torch.bool)
 
 def started(confidence, backend="auto", dtype=torch.float64, **changes):
     """Disordered particles with a random imposed field and a confidence for every node."""
-    scheme = preset("weakly_compressible", wall=PotentialWall(), shifting=None, **changes)
+    scheme = WeaklyCompressible(wall=PotentialWall(), shifting=None, **changes)
     run = Simulator(SCENE, scheme, dtype=dtype, backend=backend).start(0.0, seed=2)
     noise = torch.randn((2, 17, 17), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     run.impose(GRID, noise, EVERYWHERE, confidence)

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from torchsph import PotentialWall, Scene, Simulator, preset
+from torchsph import PotentialWall, Scene, Simulator, WeaklyCompressible
 from torchsph.particles import Particles
 from torchsph.scene import Fluid
 
@@ -25,7 +25,7 @@ def block(side=12):
 
 def after_one_step(backend, time=1e-5, **changes):
     options = {"sound_speed": 10.0, "density_diffusion": None} | STILL | changes
-    scheme = preset("weakly_compressible", **options)
+    scheme = WeaklyCompressible(**options)
     run = Simulator(OPEN, scheme, dtype=torch.float64, backend=backend).resume(block(), 0.0)
     run.advance(time)
     assert int(run.record.steps) == 1
@@ -71,7 +71,7 @@ def test_hughes_graham_halves_fly_apart_without_being_held_back():
         one = torch.ones(144, dtype=torch.float64)
         start = Particles(position, velocity, 0 * one, one, label, label, 1)
         options = STILL | {"sound_speed": 10.0, "pressure": "symmetric", "density_diffusion": None}
-        scheme = preset("weakly_compressible", hughes_graham=hughes_graham, **options)
+        scheme = WeaklyCompressible(hughes_graham=hughes_graham, **options)
         run = Simulator(OPEN, scheme, dtype=torch.float64).resume(start, 0.0)
         run.advance(0.01)
         speeds.append(float(run.particles.velocity[right, 0].mean()))
@@ -81,7 +81,7 @@ def test_hughes_graham_halves_fly_apart_without_being_held_back():
 
 def test_hughes_graham_pressure_is_that_of_the_thesis():
     """2.25 at rho* = max(rho, rho0)."""
-    scheme = preset("weakly_compressible", gamma=7.0, sound_speed=10.0, hughes_graham=True)
+    scheme = WeaklyCompressible(gamma=7.0, sound_speed=10.0, hughes_graham=True)
     simulator = Simulator(OPEN, scheme, dtype=torch.float64)
     start = block()
     pressure = simulator.resume(start, 0.0)._stepper.pressure(start)
@@ -91,6 +91,6 @@ def test_hughes_graham_pressure_is_that_of_the_thesis():
 
 def test_forms_that_do_not_exist():
     with pytest.raises(ValueError, match="diffusion_form must be one of"):
-        preset("weakly_compressible", diffusion_form="antuono")
+        WeaklyCompressible(diffusion_form="antuono")
     with pytest.raises(ValueError, match="density_filter must be one of"):
-        preset("weakly_compressible", density_filter="least squares")
+        WeaklyCompressible(density_filter="least squares")

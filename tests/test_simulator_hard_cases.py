@@ -7,7 +7,7 @@ import pytest
 import torch
 
 import geometry
-from torchsph import NumericalFailure, Rollback, Scene, Simulator, preset
+from torchsph import NumericalFailure, Rollback, Scene, Simulator, WeaklyCompressible
 from torchsph.particles import Particles
 from torchsph.scene import Fluid
 from torchsph.terms import LIMITS
@@ -32,7 +32,7 @@ def lattice(count, dtype):
 
 def resumed(scene, particles, backend="auto", **changes):
     options = {"sound_speed": 10.0} | changes
-    scheme = preset("weakly_compressible", **options)
+    scheme = WeaklyCompressible(**options)
     simulator = Simulator(scene, scheme, dtype=particles.position.dtype, backend=backend)
     return simulator.resume(particles, 0.0)
 
@@ -199,14 +199,14 @@ def test_a_runaway_particle_meets_the_floor_of_the_step():
     run.advance(0.03)
     assert int(run.record.reductions) == 1
     with pytest.raises(ValueError, match="step_floor must lie in"):
-        preset("weakly_compressible", step_floor=2.0)
+        WeaklyCompressible(step_floor=2.0)
 
 
 @pytest.mark.parametrize("dtype", PRECISIONS)
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_white_noise_imposed_at_the_level_of_a_measurement_relaxes(dtype, backend):
     """0.3 m/s on every node, as where tracking is bad: the energy falls from the start on and stays low."""
-    scheme = preset("weakly_compressible", sound_speed=10.0)
+    scheme = WeaklyCompressible(sound_speed=10.0)
     run = Simulator(PERIODIC, scheme, dtype=dtype, backend=backend).start(0.0)
     grid = geometry.Grid((0.0, 0.0), (0.05, 0.05), (21, 21))
     noise = 0.3 * torch.randn((2, 21, 21), generator=torch.Generator().manual_seed(1), dtype=torch.float64)
@@ -269,7 +269,7 @@ def test_a_ventricle_of_three_centimetres_in_float32_follows_float64(backend):
     """SI lengths of 0.03 m and speeds of 2 m/s through an open valve for 10 ms: the same field within 1e-4."""
     recording = geometry.Ventricle().recording(np.arange(0.28, 0.321, 0.01), grid_spacing=2.5e-3, wall_spacing=2e-3)
     scene = Scene.from_recording(recording, 2.5e-3)
-    scheme = preset("weakly_compressible")
+    scheme = WeaklyCompressible()
     start = Simulator(scene, scheme, dtype=torch.float64).start(0.3, seed=1).particles
     mask = torch.from_numpy(np.array(recording.mask[2], bool))
     fields = []
@@ -293,7 +293,7 @@ def test_a_closed_box_does_not_drift_in_fifty_thousand_steps(dtype, backend):
     corners = np.array([[0, 0], [size, 0], [size, size], [0, size]], float)
     walls = geometry.WallMotion.at_rest(geometry.polygon(corners, 0.005))
     scene = Scene(spacing=0.02, fluid=Fluid(1000.0, 1.0), walls=walls, reference_speed=1.0, dimension=2)
-    run = Simulator(scene, preset("weakly_compressible", sound_speed=10.0), dtype=dtype, backend=backend).start(0.0)
+    run = Simulator(scene, WeaklyCompressible(sound_speed=10.0), dtype=dtype, backend=backend).start(0.0)
     stir = torch.randn(run.particles.position.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     run.particles = run.particles.changed(velocity=(0.1 * stir).to(dtype))
     begin, step = energy(run), 0.35 * 1.3 * 0.02 / 10

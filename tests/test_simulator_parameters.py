@@ -9,7 +9,7 @@ import pytest
 import torch
 from scipy.special import j0
 
-from torchsph import XSPH, GammaRamp, PotentialWall, Scene, Simulator, preset, simulation
+from torchsph import XSPH, GammaRamp, PotentialWall, Scene, Simulator, WeaklyCompressible, preset, simulation
 from torchsph.particles import Particles
 from torchsph.scene import Fluid
 from torchsph.smoothing import kernel
@@ -40,7 +40,7 @@ def wave_speed(sound_speed=10.0, members=1, changes=None, **options):
     count = 32
     scene = Scene(spacing=1 / count, fluid=Fluid(1.0, 0.0), period=(1.0, 10 / count), dimension=2)
     options = PLAIN | {"sound_speed": sound_speed, "smoothing_ratio": 1.5, "order": "predictor_corrector"} | options
-    scheme = preset("weakly_compressible", **options)
+    scheme = WeaklyCompressible(**options)
     position = lattice(count, 10)
     shape = torch.cos(2 * math.pi * position[:, 0] / count)
     start = particles_at(position, torch.zeros_like(position), 1e-4 * shape, members)
@@ -66,7 +66,7 @@ def test_a_fluid_at_the_start_of_its_ramp_carries_sound_at_the_speed_of_its_gamm
 
 def test_gamma_grows_linearly_from_every_imposition_on():
     scene = Scene(spacing=1 / 12, fluid=Fluid(1.0, 0.0), period=(1.0, 1.0), dimension=2)
-    scheme = preset("weakly_compressible", gamma=5.0, gamma_ramp=GammaRamp(1.0, 0.1))
+    scheme = WeaklyCompressible(gamma=5.0, gamma_ramp=GammaRamp(1.0, 0.1))
     run = Simulator(scene, scheme, dtype=torch.float64).start(2.0)
     gammas = []
     used = run._stepper.use
@@ -97,7 +97,7 @@ def test_members_with_their_own_sound_speed():
 def test_members_with_their_own_viscosity_decay_each_at_its_rate_and_another_one_from_now_on():
     """Kinetic energy of a Taylor-Green vortex falls as exp(-16 pi^2 nu t), nu changing half-way."""
     scene = Scene(spacing=1 / 24, fluid=Fluid(2.0, 0.0), period=(1.0, 1.0), dimension=2)
-    scheme = preset("weakly_compressible", sound_speed=10.0, artificial_viscosity=None, bulk_damping=None)
+    scheme = WeaklyCompressible(sound_speed=10.0, artificial_viscosity=None, bulk_damping=None)
     position = lattice(24, 24)
     x, y = (2 * math.pi * position / 24).unbind(1)
     velocity = torch.stack([-torch.cos(x) * torch.sin(y), torch.sin(x) * torch.cos(y)], 1)
@@ -125,7 +125,7 @@ def test_members_with_their_own_viscosity_decay_each_at_its_rate_and_another_one
 def test_a_changed_parameter_is_the_scheme_with_that_parameter(name, backend):
     """Each member of a batch moves as a run of its own whose scheme has its value from the start."""
     scene = Scene(spacing=1 / 16, fluid=Fluid(1.0, 0.01), period=(1.0, 1.0), dimension=2)
-    scheme = preset("weakly_compressible", xsph=XSPH(0.3, "position"), pressure="symmetric", artificial_viscosity=0.1)
+    scheme = WeaklyCompressible(xsph=XSPH(0.3, "position"), pressure="symmetric", artificial_viscosity=0.1)
     values = [0.2, 0.4] if name not in ("smoothing_ratio", "gamma") else [1.2, 1.6]
     generator = torch.Generator().manual_seed(0)
     position = lattice(16, 16) + 0.2 * torch.rand((256, 2), generator=generator, dtype=torch.float64)
@@ -191,7 +191,7 @@ def test_centroid_xsph_of_a_step_is_its_formula(level):
     start = particles_at(position, torch.randn((196, 2), generator=generator, dtype=torch.float64))
     ends, time = [], 1e-4
     for xsph in (None, XSPH(0.3, level, "centroid")):
-        scheme = preset("weakly_compressible", order=order, wall=PotentialWall(), xsph=xsph, **PLAIN)
+        scheme = WeaklyCompressible(order=order, wall=PotentialWall(), xsph=xsph, **PLAIN)
         run = Simulator(scene, scheme, dtype=torch.float64).resume(start, 0.0)
         run.advance(time)
         assert int(run.record.steps) == 1
@@ -212,7 +212,7 @@ def test_centroid_xsph_of_a_step_is_its_formula(level):
 def test_centroid_xsph_does_not_depend_on_the_other_members():
     """Cells stand where they stand in space, whatever else is in the batch."""
     scene = Scene(spacing=1 / 14, fluid=Fluid(1.0, 0.0), dimension=2)
-    scheme = preset("weakly_compressible", xsph=XSPH(0.3, "position", "centroid"))
+    scheme = WeaklyCompressible(xsph=XSPH(0.3, "position", "centroid"))
     generator = torch.Generator().manual_seed(3)
     one = particles_at(lattice(9, 9), torch.randn((81, 2), generator=generator, dtype=torch.float64))
     far = replace(one.changed(position=one.position - 3.7), member=one.member + 1, members=2)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchsph import CompleteKernelWall, preset, validation
+from torchsph import CompleteKernelWall, WeaklyCompressible, validation
 from torchsph.smoothing import kernel
 from torchsph.validation_runs import lid_driven_cavity, velocity_at
 from torchsph.wall_share import KernelShare
@@ -33,7 +33,7 @@ def ghia(component, reynolds):
 
 def cavity_errors(across, reynolds, time, **changes):
     """RMS errors of u and v along the centre lines over the lid's speed, means of the last 2 s; and the run."""
-    scheme = preset("weakly_compressible", **(validation.CAVITY_OPTIONS | changes))
+    scheme = WeaklyCompressible(**(validation.CAVITY_OPTIONS | changes))
     run = lid_driven_cavity(across, reynolds, scheme=scheme)
     (y, u), (x, v) = ghia("u", reynolds), ghia("v", reynolds)
     points = np.concatenate([np.stack([np.full_like(y, 0.5), y], 1), np.stack([x, np.full_like(x, 0.5)], 1)])
@@ -72,7 +72,7 @@ def test_a_sliding_lid_sweeps_nothing():
     options = validation.CAVITY_OPTIONS | {"density_diffusion": None, "constant_volume": False}
     rates = {}
     for sliding in (False, True):
-        scheme = preset("weakly_compressible", **(options | {"wall": CompleteKernelWall(sliding=sliding)}))
+        scheme = WeaklyCompressible(**(options | {"wall": CompleteKernelWall(sliding=sliding)}))
         run = lid_driven_cavity(across, 100.0, scheme=scheme)
         axis = torch.linspace(0.1, across - 0.1, 60)
         points = torch.cartesian_prod(axis, axis)

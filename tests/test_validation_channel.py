@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 import geometry
-from torchsph import CompleteKernelWall, Scene, Simulator, preset, validation
+from torchsph import CompleteKernelWall, Scene, Simulator, WeaklyCompressible, validation
 from torchsph.validation_runs import channel, channel_error
 
 
 def worst_error(flow, across, times, **changes):
     """Largest RMS velocity error over the largest velocity (1 m/s) at any of ``times`` (s)."""
-    run = channel(flow, across, scheme=preset("weakly_compressible", **(validation.CHANNEL_OPTIONS | changes)))
+    run = channel(flow, across, scheme=WeaklyCompressible(**(validation.CHANNEL_OPTIONS | changes)))
     errors = []
     for time in times:
         run.advance(time)

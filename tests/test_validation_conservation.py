@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from torchsph import Scene, Simulator, preset, validation
+from torchsph import Scene, Simulator, WeaklyCompressible, preset, validation
 from torchsph.pairs import backend
 from torchsph.pairs.interface import MomentumTerms, PairState, Support
 from torchsph.particles import Particles
@@ -27,7 +27,7 @@ def rotating_patch(viscosity, dtype=torch.float64, **changes):
     velocity = omega * torch.stack([-arm[:, 1], arm[:, 0]], 1) + torch.tensor([0.3, -0.2], dtype=dtype)
     one, label = torch.ones_like(position[:, 0]), torch.zeros(len(position), dtype=torch.int64)
     start = Particles(position, velocity, 0 * one, one, label, label, 1)
-    scheme = preset("weakly_compressible", **(validation.FREE_SURFACE_OPTIONS | changes))
+    scheme = WeaklyCompressible(**(validation.FREE_SURFACE_OPTIONS | changes))
     return Simulator(scene, scheme, dtype=dtype).resume(start, 0.0)
 
 

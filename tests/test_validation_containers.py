@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 from wall_cases import assert_all_inside, assert_nothing_went_wrong
 
 import geometry
-from torchsph import Scene, Simulator, preset
+from torchsph import Scene, Simulator, WeaklyCompressible
 from torchsph.scene import Fluid
 
 GRAVITY = 1.0
@@ -27,7 +27,7 @@ def settled(name, across, time, **changes):
         spacing=1 / across, fluid=Fluid(1.0, 0.05), walls=geometry.WallMotion.at_rest(surface),
         gravity=(0.0, 0.0, -GRAVITY),
     )  # fmt: skip
-    scheme = preset("weakly_compressible", **({"sound_speed": 10.0} | changes))
+    scheme = WeaklyCompressible(**({"sound_speed": 10.0} | changes))
     run = Simulator(scene, scheme).start(0.0)
     run.advance(time)
     p = run.particles

@@ -6,7 +6,7 @@ import torch
 from wall_cases import annulus, assert_all_inside, assert_nothing_went_wrong
 
 import geometry
-from torchsph import Scene, Simulator, preset, validation_walls
+from torchsph import Scene, Simulator, WeaklyCompressible, validation_walls
 from torchsph.scene import Fluid
 
 INNER, OUTER, VISCOSITY = 0.5, 1.0, 0.1
@@ -22,7 +22,7 @@ def couette_error(across, time, **changes):
     walls = geometry.WallMotion(np.zeros(1), surface.vertices[None], rates[None], surface.faces, surface.region)
     scene = Scene(spacing=spacing, fluid=Fluid(1.0, VISCOSITY), walls=walls, dimension=2)
     options = validation_walls.CURVED_WALL_OPTIONS | {"smoothing_ratio": 2.0} | changes
-    run = Simulator(scene, preset("weakly_compressible", **options)).start(0.0)
+    run = Simulator(scene, WeaklyCompressible(**options)).start(0.0)
 
     def exact():
         place = run.particles.position.double() * spacing

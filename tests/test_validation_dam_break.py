@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchsph import PotentialWall, Simulator, preset
+from torchsph import PotentialWall, Simulator, WeaklyCompressible
 from torchsph.dam_breaks import GRAVITY, KOSHIZUKA_OKA_1996, MARTIN_MOYCE_1952, column_scene, front_error, surge_front
 from torchsph.free_surface import resting_block
 from torchsph.validation import FREE_SURFACE_OPTIONS
@@ -21,7 +21,7 @@ def collapse(spacing, viscosity, *, dtype=torch.float32, backend="auto", **chang
     """(front error against each experiment, front relative to Martin & Moyce's, energy over time, record)"""
     scene = column_scene(spacing, viscosity=viscosity)
     options = FREE_SURFACE_OPTIONS | {"sound_speed": 5.0 * scene.reference_speed} | changes
-    simulator = Simulator(scene, preset("weakly_compressible", **options), dtype=dtype, backend=backend)
+    simulator = Simulator(scene, WeaklyCompressible(**options), dtype=dtype, backend=backend)
     run = simulator.resume(resting_block(simulator, (0.0, 0.0), (1.0, 2.0)), 0.0)
     time, front, energy = np.arange(0.1, 3.15, 0.1), [], []
     for t in time:

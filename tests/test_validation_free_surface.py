@@ -7,7 +7,7 @@ import pytest
 import torch
 
 import geometry
-from torchsph import CompleteKernelWall, PotentialWall, Scene, Simulator, preset
+from torchsph import CompleteKernelWall, PotentialWall, Scene, Simulator, WeaklyCompressible
 from torchsph.free_surface import resting_block, wall_pressure
 from torchsph.scene import Fluid
 from torchsph.validation import FREE_SURFACE_OPTIONS, STRETCHED_SURFACE_OPTIONS
@@ -28,7 +28,7 @@ def patch_pressure(x, y):
 def patch(count, *, dtype=torch.float64, backend="auto", **options):
     """A patch of 1 m that turns with 1 / s; it starts with the pressure of the incompressible fluid."""
     scene = Scene(spacing=1 / count, fluid=Fluid(1000.0, 0.0), dimension=2)
-    simulator = Simulator(scene, preset("weakly_compressible", **options), dtype=dtype, backend=backend)
+    simulator = Simulator(scene, WeaklyCompressible(**options), dtype=dtype, backend=backend)
     block = resting_block(simulator, (-0.5, -0.5), (0.5, 0.5))
     x, y = (block.position / count).unbind(1)
     pressure = patch_pressure(x.double().numpy(), y.double().numpy())
@@ -95,7 +95,7 @@ def test_what_shifting_below_the_surface_is_for():
     assert largest_void(run, count) > 3.0
     assert angular_momentum(run) == pytest.approx(momentum, rel=1e-12)
     with pytest.raises(ValueError, match="shifting_surface must be positive and needs shifting"):
-        preset("weakly_compressible", shifting=None, shifting_surface=0.15)
+        WeaklyCompressible(shifting=None, shifting_surface=0.15)
 
 
 WEDGE = np.array([[0.7, 0.0], [1.0, 0.4], [1.3, 0.0]])
@@ -110,7 +110,7 @@ def on_a_wedge(dtype, backend, wall, spacing=0.05):
         walls=geometry.WallMotion.at_rest(surface),
     )  # fmt: skip
     options = FREE_SURFACE_OPTIONS | {"sound_speed": 30.0, "wall": wall}
-    simulator = Simulator(scene, preset("weakly_compressible", **options), dtype=dtype, backend=backend)
+    simulator = Simulator(scene, WeaklyCompressible(**options), dtype=dtype, backend=backend)
     return simulator.resume(resting_block(simulator, (0.6, 0.8), (1.4, 1.6)), 0.0)
 
 
@@ -168,7 +168,7 @@ def test_pressure_probes():
         spacing=spacing, fluid=Fluid(1000.0, 10.0), dimension=2, gravity=(0.0, -9.81), reference_speed=4.0,
         walls=geometry.WallMotion.at_rest(surface),
     )  # fmt: skip
-    simulator = Simulator(scene, preset("weakly_compressible", **(FREE_SURFACE_OPTIONS | {"sound_speed": 40.0})))
+    simulator = Simulator(scene, WeaklyCompressible(**(FREE_SURFACE_OPTIONS | {"sound_speed": 40.0})))
     block = resting_block(simulator, (0.0, 0.0), (1.0, 1.0))
     depth = 1.0 - block.position[:, 1] * spacing
     run = simulator.resume(block.changed(deviation=9.81 * depth / 40.0**2), 0.0)

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 import geometry
-from torchsph import Scene, Simulator, preset
+from torchsph import Scene, Simulator, WeaklyCompressible
 from torchsph.scene import Fluid
 
 GRAVITY = 1.0
@@ -19,7 +19,7 @@ def column(**changes):
         spacing=spacing, fluid=Fluid(1.0, 0.05), walls=geometry.WallMotion.at_rest(surface),
         gravity=(0.0, -GRAVITY), dimension=2,
     )  # fmt: skip
-    scheme = preset("weakly_compressible", **({"sound_speed": 10.0, "smoothing_ratio": 2.0} | changes))
+    scheme = WeaklyCompressible(**({"sound_speed": 10.0, "smoothing_ratio": 2.0} | changes))
     run = Simulator(scene, scheme, dtype=torch.float64).start(0.0)
     run.advance(3.0)
     p = run.particles

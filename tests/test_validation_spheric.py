@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchsph import Simulator, preset
+from torchsph import Simulator, WeaklyCompressible
 from torchsph.dam_breaks import (
     GRAVITY,
     IMPACT_OPTIONS,
@@ -68,7 +68,7 @@ def test_dam_break_on_an_obstacle():
     """
     scene = obstacle_scene(0.04)
     options = IMPACT_OPTIONS | {"sound_speed": 10.0 * scene.reference_speed}
-    run = obstacle_run(Simulator(scene, preset("weakly_compressible", **options)))
+    run = obstacle_run(Simulator(scene, WeaklyCompressible(**options)))
     time, raw = obstacle_pressures(run, 1.5)
     assert int(run.record.outside.sum()) == 0 and not bool(run.record.failed.any())
     assert float(run.record.smallest_density) > 0.85 and float(run.record.largest_density) < 1.15

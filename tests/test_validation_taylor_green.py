@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from torchsph import preset, validation
+from torchsph import WeaklyCompressible, validation
 from torchsph.validation_runs import kinetic_energy, taylor_green, taylor_green_error
 
 DECAY_TIME = 100 / (8 * math.pi**2)  # at Re 100
@@ -16,7 +16,7 @@ EXPERIMENTS = Path(__file__).resolve().parents[2] / "shared" / "data" / "experim
 
 def plane_error(resolution, duration, **changes):
     """Relative L2 velocity error at Re 100 after ``duration`` with the options for periodic flows."""
-    run = taylor_green(resolution, scheme=preset("weakly_compressible", **(validation.PERIODIC_OPTIONS | changes)))
+    run = taylor_green(resolution, scheme=WeaklyCompressible(**(validation.PERIODIC_OPTIONS | changes)))
     run.advance(duration)
     assert not bool(run.record.failed.any())
     return taylor_green_error(run)
@@ -59,7 +59,7 @@ def energy_table(reynolds):
 def worst_energy(resolution, reynolds, **changes):
     """Largest deviation of the kinetic energy from the table, relative to its present value, until t = 5."""
     time, energy = energy_table(reynolds).T
-    scheme = preset("weakly_compressible", **(validation.PERIODIC_OPTIONS_3D | changes))
+    scheme = WeaklyCompressible(**(validation.PERIODIC_OPTIONS_3D | changes))
     run = taylor_green(resolution, reynolds, dimension=3, scheme=scheme)
     worst = 0.0
     for until in (1.0, 2.0, 3.0, 4.0, 5.0):

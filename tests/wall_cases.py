@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 import geometry
-from torchsph import Scene, Simulator, preset, validation_walls
+from torchsph import Scene, Simulator, WeaklyCompressible, validation_walls
 from torchsph.scene import Fluid
 
 RADIUS = 0.5
@@ -21,7 +21,7 @@ def pipe(across, viscosity, gravity, length=10, dtype=torch.float32, **changes):
         spacing=spacing, fluid=Fluid(1.0, viscosity), walls=geometry.WallMotion.at_rest(tube),
         period=(None, None, length * spacing), gravity=gravity,
     )  # fmt: skip
-    scheme = preset("weakly_compressible", **(validation_walls.CURVED_WALL_OPTIONS | changes))
+    scheme = WeaklyCompressible(**(validation_walls.CURVED_WALL_OPTIONS | changes))
     return Simulator(scene, scheme, dtype=dtype).start(0.0)
 
 

@@ -62,8 +62,8 @@ class Neighbourhood:
         """Filling relative to the mean of the member's particles whose kernel is cut alike by walls, less 1: (N,).
 
         At walls particles stand in layers, where the sum is off by percents all the time: against one mean for all it
-        would be a source without end, and drive a flow along the walls. It is 0 where not ``counted`` (N,) bool, and has
-        no mean, so that it takes no part in what flows through a valve.
+        would be a source without end, and drive a flow along the walls. It is 0 where not ``counted`` (N,) bool, and
+        has no mean, so that it takes no part in what flows through a valve.
         """
         p = self.particles
         group = p.member

@@ -12,7 +12,6 @@ import geometry
 
 from . import validation
 from .pairs import backend as choose_backend
-from .presets import preset
 from .scene import Fluid, Scene
 from .schemes import WeaklyCompressible
 from .seeding import Seeding
@@ -39,7 +38,7 @@ def taylor_green(
     side = 1.0 if plane else 2 * math.pi
     if scheme is None:
         options = validation.PERIODIC_OPTIONS if plane else validation.PERIODIC_OPTIONS_3D
-        scheme = preset("weakly_compressible", **options)
+        scheme = WeaklyCompressible(**options)
     scene = Scene(
         spacing=side / resolution, fluid=Fluid(1.0, 1 / reynolds), period=(side,) * dimension, dimension=dimension
     )
@@ -83,7 +82,7 @@ def channel(
         spacing=spacing, fluid=Fluid(1.0, _CHANNEL_VISCOSITY), walls=_driven(surface, drive), period=(length, None),
         gravity=(8 * _CHANNEL_VISCOSITY if flow == "poiseuille" else 0.0, 0.0), dimension=2,
     )  # fmt: skip
-    scheme = scheme or preset("weakly_compressible", **validation.CHANNEL_OPTIONS)
+    scheme = scheme or WeaklyCompressible(**validation.CHANNEL_OPTIONS)
     return Simulator(scene, scheme, backend=backend, seeding=_LATTICE).start(0.0)
 
 
@@ -105,7 +104,7 @@ def lid_driven_cavity(across: int, reynolds: float, *, scheme: WeaklyCompressibl
     # the corners belong to the walls at rest: the lid must not drag fluid through them
     drive = np.where(np.isclose(y, 1.0) & ~np.isclose(x, 0.0) & ~np.isclose(x, 1.0), 1.0, 0.0)
     scene = Scene(spacing=spacing, fluid=Fluid(1.0, 1 / reynolds), walls=_driven(surface, drive), dimension=2)
-    return Simulator(scene, scheme or preset("weakly_compressible", **validation.CAVITY_OPTIONS)).start(0.0)
+    return Simulator(scene, scheme or WeaklyCompressible(**validation.CAVITY_OPTIONS)).start(0.0)
 
 
 def velocity_at(run: Simulation, points: np.ndarray) -> np.ndarray:

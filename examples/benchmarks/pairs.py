@@ -26,7 +26,7 @@ from dataclasses import asdict, dataclass
 
 import torch
 
-from torchsph import Fluid, Scene, Simulator, preset
+from torchsph import Fluid, Scene, Simulator, WeaklyCompressible
 from torchsph.pairs import Backend, MomentumTerms, PairState, RateTerms, Support, available_backends, backend
 from torchsph.pairs.interface import square_length
 from torchsph.pairs.native import library
@@ -172,7 +172,7 @@ def simulator_share(engine: Backend, side: int, rounds: int) -> float:
     """Processor time of the default scheme's two passes over that of the simulator's whole step, one thread."""
     torch.set_num_threads(1)
     scene = Scene(spacing=1 / side, fluid=Fluid(1.0, 0.01), period=(1.0,) * 3)
-    scheme = preset("weakly_compressible", sound_speed=SOUND_SPEED)
+    scheme = WeaklyCompressible(sound_speed=SOUND_SPEED)
     run = Simulator(scene, scheme, backend=engine.name).start(0.0)
     angle = run.particles.position * (6.283185307179586 / side)
     wave = torch.stack([angle[:, 0].sin() * angle[:, 1].cos(), -angle[:, 0].cos() * angle[:, 1].sin()], 1)

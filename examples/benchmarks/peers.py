@@ -36,7 +36,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 import numpy as np
 import torch
 
-from torchsph import Simulator, preset
+from torchsph import Simulator, WeaklyCompressible
 from torchsph.dam_breaks import GRAVITY, KOSHIZUKA_OKA_1996, MARTIN_MOYCE_1952, column_scene, front_error, surge_front
 from torchsph.free_surface import resting_block
 from torchsph.validation import FREE_SURFACE_OPTIONS
@@ -55,7 +55,7 @@ def ours(spacing: float, mach: float) -> dict:
     largest = math.sqrt(2 * GRAVITY * 2.0)
     kinematic = ALPHA * (largest / PYSPH_MACH) * PYSPH_RATIO * spacing / 8
     scene = column_scene(spacing, viscosity=1000.0 * kinematic)
-    simulator = Simulator(scene, preset("weakly_compressible", **(OPTIONS | {"sound_speed": largest / mach})))
+    simulator = Simulator(scene, WeaklyCompressible(**(OPTIONS | {"sound_speed": largest / mach})))
     run = simulator.resume(resting_block(simulator, (0.0, 0.0), (1.0, 2.0)), 0.0)
     times, front = np.linspace(0.08, LAST, 37), []
     cpu, wall = time.process_time(), time.perf_counter()

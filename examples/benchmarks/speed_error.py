@@ -33,7 +33,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 import torch
 
 import geometry
-from torchsph import PotentialWall, Scene, Simulator, preset, skill, validation
+from torchsph import PotentialWall, Scene, Simulator, WeaklyCompressible, skill, validation
 from torchsph.data import sample_truth
 from torchsph.validation_runs import channel, channel_error, kinetic_energy, taylor_green, taylor_green_error
 
@@ -75,7 +75,7 @@ def timed(action: Callable[[], float]) -> tuple[float, float, float]:
 
 def plane(resolution: float, options: dict, backend: str, quick: bool) -> tuple[float, float, float, float]:
     """Taylor-Green in the plane."""
-    run = taylor_green(int(resolution), scheme=preset("weakly_compressible", **options), backend=backend)
+    run = taylor_green(int(resolution), scheme=WeaklyCompressible(**options), backend=backend)
 
     def action() -> float:
         run.advance(DECAY_TIME / 5 if quick else DECAY_TIME)
@@ -86,7 +86,7 @@ def plane(resolution: float, options: dict, backend: str, quick: bool) -> tuple[
 
 def space(resolution: float, options: dict, backend: str, quick: bool) -> tuple[float, float, float, float]:
     """Taylor-Green in space."""
-    run = taylor_green(int(resolution), dimension=3, scheme=preset("weakly_compressible", **options), backend=backend)
+    run = taylor_green(int(resolution), dimension=3, scheme=WeaklyCompressible(**options), backend=backend)
 
     def action() -> float:
         worst = 0.0
@@ -100,7 +100,7 @@ def space(resolution: float, options: dict, backend: str, quick: bool) -> tuple[
 
 def poiseuille(resolution: float, options: dict, backend: str, _: bool) -> tuple[float, float, float, float]:
     """Start-up of plane Poiseuille flow."""
-    run = channel("poiseuille", int(resolution), scheme=preset("weakly_compressible", **options), backend=backend)
+    run = channel("poiseuille", int(resolution), scheme=WeaklyCompressible(**options), backend=backend)
 
     def action() -> float:
         run.advance(0.5)
@@ -117,7 +117,7 @@ def ventricle(resolution: float, options: dict, backend: str, quick: bool) -> tu
     def action() -> float:
         nonlocal steps
         scene = Scene.from_recording(recording, 1e-3 * resolution)
-        model = Simulator(scene, preset("weakly_compressible", **options), backend=backend)
+        model = Simulator(scene, WeaklyCompressible(**options), backend=backend)
         result = skill(recording, model, (0.02,), every=recording.frames if quick else 12)
         steps = model.start(float(recording.time[0])).particles.count * float(result.info["steps"])
         return result.leads[0]["nrmse"]["model"]

@@ -34,7 +34,15 @@ import torch
 from scipy.spatial.transform import Rotation
 
 import geometry
-from torchsph import CompleteKernelWall, PotentialWall, Scene, Simulator, preset, validation_walls, wall_closest
+from torchsph import (
+    CompleteKernelWall,
+    PotentialWall,
+    Scene,
+    Simulator,
+    WeaklyCompressible,
+    validation_walls,
+    wall_closest,
+)
 from torchsph.scene import Fluid
 from torchsph.smoothing import kernel
 from torchsph.wallfield import WallFields
@@ -56,7 +64,7 @@ def pipe(wall: object, duration: float, across: int = 16, length: int = 10) -> d
         spacing=spacing, fluid=Fluid(1.0, VISCOSITY), walls=geometry.WallMotion.at_rest(tube),
         period=(None, None, length * spacing), gravity=(0.0, 0.0, FORCE),
     )  # fmt: skip
-    scheme = preset("weakly_compressible", sound_speed=10.0, artificial_viscosity=None, wall=wall)
+    scheme = WeaklyCompressible(sound_speed=10.0, artificial_viscosity=None, wall=wall)
     run = Simulator(scene, scheme).start(0.0)
 
     def exact() -> torch.Tensor:
@@ -88,7 +96,7 @@ def at_rest(name: str, wall: object, duration: float, across: int = 12) -> dict[
         spacing=1 / across, fluid=Fluid(1.0, 0.05), walls=geometry.WallMotion.at_rest(surface),
         gravity=(0.0, 0.0, -1.0),
     )  # fmt: skip
-    scheme = preset("weakly_compressible", sound_speed=10.0, wall=wall)
+    scheme = WeaklyCompressible(sound_speed=10.0, wall=wall)
     run = Simulator(scene, scheme).start(0.0)
     run.advance(duration)
     p = run.particles
@@ -103,7 +111,7 @@ def part_of_step(wall: object, across: int, steps: int) -> dict[str, float]:
     """CPU seconds per step and the walls' part of it: the same steps without them, from the same state."""
     surface = container("sphere", 1 / across)
     scene = Scene(spacing=1 / across, walls=geometry.WallMotion.at_rest(surface), gravity=(0.0, 0.0, -1.0))
-    simulator = Simulator(scene, preset("weakly_compressible", wall=wall))
+    simulator = Simulator(scene, WeaklyCompressible(wall=wall))
     start = simulator.start(0.0).particles
     duration = steps * 0.35 * 1.3 / across / 6.0
 
