@@ -152,7 +152,7 @@ def test_bad_scenes_and_options_are_refused():
         Scene(spacing=1.0, valves=(Valve(1, ((0.0, 1.0),)),))
     with pytest.raises(ValueError, match="period of .* spacings is not a whole number"):
         Simulator(replace(PERIODIC, spacing=0.037)).start(0.0)
-    with pytest.raises(ValueError, match="unknown preset 'best'; known: default, thesis, weakly_compressible"):
+    with pytest.raises(ValueError, match="unknown preset 'best'; known: default, projection, thesis"):
         preset("best")
     with pytest.raises(ValueError, match="WeaklyCompressible.pressure must be one of"):
         WeaklyCompressible(pressure="odd")

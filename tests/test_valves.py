@@ -7,7 +7,7 @@ import pytest
 import torch
 
 import geometry
-from torchsph import PressureSource, Scene, Simulator, preset, simulation
+from torchsph import PressureSource, Scene, Simulator, WeaklyCompressible, preset, simulation
 from torchsph.sources import Sources
 from torchsph.units import Units
 
@@ -150,7 +150,7 @@ def test_the_flow_through_a_valve_does_not_feel_how_often_neighbours_are_searche
     fields, searches = [], []
     for margin in (0.1, 0.5):
         monkeypatch.setattr(simulation, "_SEARCH_MARGIN", margin)
-        run = Simulator(scene, preset("weakly_compressible"), dtype=torch.float64).start(0.30, seed=1)
+        run = Simulator(scene, WeaklyCompressible(), dtype=torch.float64).start(0.30, seed=1)
         run.impose(recording.grid, torch.from_numpy(recording.velocity[30].astype(np.float64)), mask)
         run.advance(0.315)
         fields.append(run.fetch(recording.grid, mask).value)

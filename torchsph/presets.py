@@ -14,10 +14,10 @@ Scheme = WeaklyCompressible | Projection
 _THESIS_RATIO = 16 ** (1 / 3) / 3
 
 PRESETS: dict[str, Scheme] = {
-    "default": Projection(),
-    "weakly_compressible": WeaklyCompressible(
-        artificial_viscosity=None, density_diffusion=0.2, shifting=1.0, shifting_speed="largest",
+    "default": WeaklyCompressible(
+        artificial_viscosity=None, density_diffusion=0.2, shifting=4.0, shifting_speed="largest", courant=0.5,
     ),
+    "projection": Projection(),
     "thesis": WeaklyCompressible(
         kernel="gaussian", smoothing_ratio=_THESIS_RATIO, sound_speed=5.0, gamma=3.0, background_pressure=0.2,
         continuity="mass", pressure="symmetric", artificial_viscosity=0.5, laminar_viscosity=False,
@@ -30,8 +30,8 @@ PRESETS: dict[str, Scheme] = {
 def preset(name: str, **changes: object) -> Scheme:
     """The preset called ``name``, with some options changed.
 
-    "default" is incompressible, "weakly_compressible" the best with an equation of state (also for free surfaces),
-    "thesis" table 4.1. What chose them is measured in ``examples/benchmarks``.
+    "default" is weakly compressible, "projection" incompressible, "thesis" table 4.1. What chose the components of the
+    default is measured in ``examples/benchmarks/preset.py``.
     """
     if name not in PRESETS:
         raise ValueError(f"unknown preset '{name}'; known: {', '.join(sorted(PRESETS))}")

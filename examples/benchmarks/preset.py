@@ -118,7 +118,7 @@ def ventricle(recording: geometry.Recording, spacing: float, every: int, changes
     """NRMSE per lead and CPU seconds of forecasts with the changed preset; None where the run failed."""
     began = time.process_time()
     try:
-        model = Simulator(Scene.from_recording(recording, spacing), preset("weakly_compressible", **changes))
+        model = Simulator(Scene.from_recording(recording, spacing), preset("default", **changes))
         result = skill(recording, model, LEADS, every=every)
     except NumericalFailure:
         return {"nrmse": None, "cpu_s": time.process_time() - began}
@@ -131,7 +131,7 @@ def ventricle(recording: geometry.Recording, spacing: float, every: int, changes
 
 def vortex(resolution: int, changes: dict[str, object]) -> dict:
     """Error and CPU seconds of the vortex with the changed preset; None where the run failed."""
-    run = taylor_green(resolution, scheme=preset("weakly_compressible", **changes))
+    run = taylor_green(resolution, scheme=preset("default", **changes))
     began = time.process_time()
     try:
         run.advance(DECAY_TIME / 5)
