@@ -12,6 +12,7 @@ import geometry
 
 from . import validation
 from .pairs import backend as choose_backend
+from .presets import Scheme
 from .scene import Fluid, Scene
 from .schemes import WeaklyCompressible
 from .seeding import Seeding
@@ -26,7 +27,7 @@ _FETCH_RADIUS = 2.0
 
 
 def taylor_green(
-    resolution: int, reynolds: float = 100.0, *, dimension: int = 2, scheme: WeaklyCompressible | None = None,
+    resolution: int, reynolds: float = 100.0, *, dimension: int = 2, scheme: Scheme | None = None,
     backend: str = "auto", seeding: Seeding = _LATTICE,
 ) -> Simulation:
     """A Taylor-Green vortex on resolution^dimension particles at its start: velocity and pressure as they should be.
@@ -49,7 +50,9 @@ def taylor_green(
         pressure = validation.taylor_green_2d_pressure(points, 0.0, 1 / reynolds)
     else:
         velocity, pressure = validation.taylor_green_3d(points), validation.taylor_green_3d_pressure(points)
-    run.particles = run.particles.changed(velocity=velocity, deviation=pressure / scheme.sound_speed**2)
+    # an incompressible fluid finds its pressure by itself
+    deviation = torch.zeros_like(pressure) if scheme.sound_speed is None else pressure / scheme.sound_speed**2
+    run.particles = run.particles.changed(velocity=velocity, deviation=deviation)
     return run
 
 

@@ -68,11 +68,14 @@ from torchsph import (
     PressureSource,
     Reservoir,
     Scene,
+    Seeding,
     Simulator,
+    Transfer,
     preset,
     skill,
 )
 from torchsph.data import sample_truth
+from torchsph.presets import Scheme
 from torchsph.validation_runs import taylor_green, taylor_green_error
 
 LEADS = (0.01, 0.04)  # s
@@ -81,7 +84,7 @@ NO_SLIP_OFF = CompleteKernelWall(no_slip=False)
 
 # component -> its rivals; the row without changes is the preset
 RIVALS: dict[str, dict[str, dict[str, object]]] = {
-    "preset": {"as it is": {}},
+    "preset": {"as it is": {}, "projection instead": {"preset": "projection"}},
     "kernel": {
         "cubic": {"kernel": "cubic"}, "quintic, h = 1": {"kernel": "quintic", "smoothing_ratio": 1.0},
         "Wendland C4, h = 1.6": {"kernel": "wendland_c4", "smoothing_ratio": 1.6},
@@ -90,36 +93,50 @@ RIVALS: dict[str, dict[str, dict[str, object]]] = {
     "sound speed": {"3.5 m/s": {"sound_speed": 3.5}, "10 m/s": {"sound_speed": 10.0}},
     "pressure": {form: {"pressure": form} for form in ("sum", "symmetric", "difference")},
     "density diffusion": {
-        "none": {"density_diffusion": None}, "0.3": {"density_diffusion": 0.3},
+        "none": {"density_diffusion": None}, "0.1": {"density_diffusion": 0.1}, "0.4": {"density_diffusion": 0.4},
         "corrected": {"diffusion_form": "corrected"},
     },
     "bulk damping": {"none": {"bulk_damping": None}, "1.0": {"bulk_damping": 1.0}},
-    "artificial viscosity": {"none": {"artificial_viscosity": None}, "0.1": {"artificial_viscosity": 0.1}},
+    "artificial viscosity": {"0.02": {"artificial_viscosity": 0.02}, "0.1": {"artificial_viscosity": 0.1}},
     "laminar viscosity": {"none": {"laminar_viscosity": False}},
     "shifting": {
-        "none": {"shifting": None}, "2": {"shifting": 2.0},
-        "4, largest speed": {"shifting": 4.0, "shifting_speed": "largest"},
+        "none": {"shifting": None}, "0.5, local speed": {"shifting": 0.5, "shifting_speed": "local"},
+        "1": {"shifting": 1.0}, "8": {"shifting": 8.0},
     },
+    "courant": {"0.35": {"courant": 0.35}, "0.7": {"courant": 0.7}},
+    "transfer": {
+        "plain fetch": {"transfer": Transfer(fade=None)},
+        "velocities not projected": {"transfer": Transfer(projections=0)},
+    },
+    "seeding": {"not packed": {"seeding": Seeding(packings=0)}},
     "XSPH": {"positions, 0.2": {"xsph": XSPH(0.2, "position")}},
     "order": {name: {"order": name} for name in ("thesis", "verlet", "predictor_corrector")},
     "wall": {"potential": {"wall": PotentialWall()}, "complete, free slip": {"wall": NO_SLIP_OFF}},
     "valve": {
-        "flat reservoir": {"valve": Reservoir("flat")}, "pressure source": {"valve": PressureSource()},
+        "flat reservoir": {"valve": Reservoir("flat")}, "volume not held": {"valve": Reservoir(relaxation=None)},
+        "run-out of 3": {"valve": Reservoir(run_out=3.0)}, "pressure source": {"valve": PressureSource()},
         "shut": {"valve": None},
     },
 }  # fmt: skip
 # what a flow without walls does not have
-WALLS_ONLY = ("wall", "valve")
+WALLS_ONLY = ("wall", "valve", "transfer", "seeding")
 # shown by --quick
 QUICK = ("preset", "pressure", "shifting")
+
+
+def scheme(changes: dict[str, object]) -> Scheme:
+    """The default preset with changes, or another preset."""
+    return preset(changes["preset"]) if "preset" in changes else preset("default", **changes)
 
 
 def ventricle(recording: geometry.Recording, spacing: float, every: int, changes: dict[str, object]) -> dict:
     """NRMSE per lead and CPU seconds of forecasts with the changed preset; None where the run failed."""
     began = time.process_time()
     try:
-        model = Simulator(Scene.from_recording(recording, spacing), preset("default", **changes))
-        result = skill(recording, model, LEADS, every=every)
+        rest = dict(changes)
+        transfer, seeding = rest.pop("transfer", None), rest.pop("seeding", None)
+        model = Simulator(Scene.from_recording(recording, spacing), scheme(rest), seeding=seeding)
+        result = skill(recording, model, LEADS, every=every, transfer=transfer)
     except NumericalFailure:
         return {"nrmse": None, "cpu_s": time.process_time() - began}
     return {
@@ -131,7 +148,7 @@ def ventricle(recording: geometry.Recording, spacing: float, every: int, changes
 
 def vortex(resolution: int, changes: dict[str, object]) -> dict:
     """Error and CPU seconds of the vortex with the changed preset; None where the run failed."""
-    run = taylor_green(resolution, scheme=preset("default", **changes))
+    run = taylor_green(resolution, scheme=scheme(changes))
     began = time.process_time()
     try:
         run.advance(DECAY_TIME / 5)
