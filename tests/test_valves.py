@@ -52,11 +52,14 @@ def test_the_open_valve_passes_what_the_volume_demands(scene, start, stop):
 def test_every_particle_is_accounted_for(scene):
     """Fluid now = fluid at the start + entered - left through a valve, whatever happens at the walls."""
     run = Simulator(scene).start(0.18, seed=0)
-    before = int(run.particles.inside.sum())
+    before, volume = int(run.particles.inside.sum()), float(run.particles.mass[run.particles.inside].sum())
     run.advance(0.29)  # ejection ends, both valves shut, the inlet opens
     entered, left = int(run.record.inserted.sum()), int(run.record.removed.sum())
     assert int(run.particles.inside.sum()) == before + entered - left
     assert left > 0 and entered > 0
+    passed = (run.record.inflow - run.record.outflow).sum() / scene.spacing**3
+    assert float(run.particles.mass[run.particles.inside].sum()) == pytest.approx(volume + float(passed), rel=1e-5)
+    assert float(run.record.filling) == pytest.approx(1.0, abs=0.03)
     assert int((run.particles.kind > 0).sum()) > 0  # the inlet's buffer is there, the outlet's is gone
     assert set(run.particles.kind.unique().tolist()) == {0, 1}
 

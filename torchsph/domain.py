@@ -250,6 +250,8 @@ class Domain:
         if wall is not None:
             beyond = (wall.distance < -_OUTSIDE) & particles.fluid
             record.outside = particles.per_member(beyond.to(torch.int64), "sum")
+            inside = particles.per_member((particles.mass * particles.inside).double(), "sum")
+            record.filling = inside * self.units.length**particles.dimension / self.fluid_volume(time)
 
     def imposed(self, particles: Particles, grid: Grid, velocity: Tensor, mask: Tensor, time: float) -> Particles:
         """Particles with the velocity of a grid field, continued beyond its mask by the walls' velocity."""

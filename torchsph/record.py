@@ -21,6 +21,8 @@ class Record:
         outside: particles beyond the wall now, in no open valve.
         crossed_wall: how often a particle was found beyond the wall and put back.
         inserted, removed: particles that entered and left, by valve: (members, valves).
+        inflow, outflow: volume that entered and left, by valve, m^D (in a plane m^2): (members, valves).
+        filling: volume of the particles inside over that of the cavity now; NaN in scenes without walls.
         limited_by: how many steps each limit decided, (members, limits); names in ``terms.LIMITS``.
         reductions: how often a limit asked for a step shorter than the step before by more than a hundredth.
         floored: steps that the scheme's floor kept longer than the limits asked for; such a run may be unstable.
@@ -46,6 +48,9 @@ class Record:
     crossed_wall: Tensor = field(init=False)
     inserted: Tensor = field(init=False)
     removed: Tensor = field(init=False)
+    inflow: Tensor = field(init=False)
+    outflow: Tensor = field(init=False)
+    filling: Tensor = field(init=False)
     limited_by: Tensor = field(init=False)
     reductions: Tensor = field(init=False)
     floored: Tensor = field(init=False)
@@ -65,6 +70,8 @@ class Record:
         self.failed = torch.zeros(self.members, dtype=torch.bool, device=self.device)
         one = torch.ones(self.members, dtype=torch.float64, device=self.device)
         self.smallest_density, self.largest_density = one.clone(), one.clone()
+        self.inflow, self.outflow = (one[:, None].repeat(1, self.valves) * 0.0 for _ in range(2))
+        self.filling = one * float("nan")
         self.largest_mach, self.largest_mismatch = torch.zeros_like(one), torch.zeros_like(one)
 
     def note_density(self, smallest: Tensor, largest: Tensor) -> None:
@@ -88,7 +95,8 @@ class Record:
             "density_range": [self.smallest_density.tolist(), self.largest_density.tolist()],
             "largest_mach": self.largest_mach.tolist(), "outside": self.outside.tolist(),
             "crossed_wall": self.crossed_wall.tolist(), "inserted": self.inserted.tolist(),
-            "removed": self.removed.tolist(), "limited_by": steps, "searches": self.searches,
+            "removed": self.removed.tolist(), "inflow": self.inflow.tolist(), "outflow": self.outflow.tolist(),
+            "filling": self.filling.tolist(), "limited_by": steps, "searches": self.searches,
             "reductions": self.reductions.tolist(), "floored": self.floored.tolist(),
             "rollbacks": self.rollbacks.tolist(), "overflows": self.overflows,
             "pressure_iterations": self.pressure_iterations.tolist(), "unconverged": self.unconverged.tolist(),

@@ -226,8 +226,12 @@ class Reservoirs:
             kind = torch.where(beyond, torch.where(height < lead, channel, buffer), kind)
             kind = torch.where(entered, torch.full_like(kind, FLUID), kind)
             gone |= beyond & (height > lead + self.length)
-            for counter, which in ((record.inserted, entered), (record.removed, out)):
-                counter[:, self.valve_of[number]] += particles.per_member(which.to(torch.int64), "sum")
+            valve, unit = self.valve_of[number], self.units.length**self.motion.dimension
+            for counter, volume, which in (
+                (record.inserted, record.inflow, entered), (record.removed, record.outflow, out),
+            ):
+                counter[:, valve] += particles.per_member(which.to(torch.int64), "sum")
+                volume[:, valve] += particles.per_member((particles.mass * which).double(), "sum") * unit
         particles = particles.changed(kind=kind)
         if not fresh and not bool(gone.any()):
             return particles, False
