@@ -9,42 +9,53 @@ the sample that comes with torchsph). Vortex: relative L2 velocity error of Tayl
 Measured (results/preset.json: --recording lv_phantom_a.h5 --every 30, 1.25 mm; three starts, persistence .33 and .88):
 
                                               10 ms   40 ms  CPU s  vortex
-    preset: as it is                          0.224   0.473    7.3  0.4413
-    kernel: cubic                             0.216   0.483    7.4  0.4195
-    kernel: quintic, h = 1                    0.229   0.519    9.5  0.4632
-    kernel: Wendland C4, h = 1.6              0.211   0.460    7.4  0.4107
-    smoothing ratio: 1.1                      0.278   0.547    7.3  0.6155
-    smoothing ratio: 1.6                      0.209   0.463    6.4  0.2986
-    sound speed: 3.5 m/s                      0.218   0.455    6.3  0.3836
-    sound speed: 10 m/s                       0.255   0.528   10.7  0.6015
-    pressure: sum                             0.226   0.490    7.1  0.4416
-    pressure: symmetric                       0.227   0.490    6.6  0.4416
-    pressure: difference                      0.223   1.633    7.4  0.2774
-    density diffusion: none                  failed            8.4  0.4506
-    density diffusion: 0.3                    0.218   0.451    7.3  0.4333
-    density diffusion: corrected              0.229   0.495    8.2  0.4456
-    bulk damping: none                        0.228   0.478    7.1  0.4561
-    bulk damping: 1.0                         0.228   0.478    7.4  0.4254
-    artificial viscosity: none                0.219   0.502    6.5  0.4424
-    artificial viscosity: 0.1                 0.272   0.546    6.5  0.4390
-    laminar viscosity: none                   0.224   0.501    6.8  0.5312
-    shifting: none                            0.233   0.559    7.0  0.4991
-    shifting: 2                               0.213   0.455    7.3  0.3835
-    shifting: 4, largest speed                0.200   0.404    7.5  0.1042
-    XSPH: positions, 0.2                      0.225   0.480    7.5  0.4600
-    order: thesis                            failed           11.9  0.4903
-    order: verlet                             0.229   0.498    8.4  0.4367
-    order: predictor_corrector                0.228   0.470    8.8  0.4391
-    wall: potential                           0.772   0.723    6.4
-    wall: complete, free slip                 0.229   0.487    6.8
-    valve: flat reservoir                     0.269   0.592    6.3
-    valve: pressure source                    1.066   2.182   10.6
-    valve: shut                               0.459   0.867    4.7
+    preset: as it is                            0.185   0.389      7.6   0.1008
+    preset: projection instead                  0.196   0.380      5.3   0.0635
+    kernel: cubic                               0.186   0.388      5.7   0.0685
+    kernel: quintic, h = 1                      0.187   0.392      6.7   0.1202
+    kernel: Wendland C4, h = 1.6                0.182   0.383      5.9   0.0647
+    smoothing ratio: 1.1                        0.200   0.461      5.5   0.1615
+    smoothing ratio: 1.6                        0.184   0.402      6.5   0.0577
+    sound speed: 3.5 m/s                        0.185   0.377      5.6   0.0880
+    sound speed: 10 m/s                         0.188   0.421      7.3   0.2212
+    pressure: sum                               0.184   0.381      5.6   0.1000
+    pressure: symmetric                         0.184   0.380      5.6   0.0995
+    pressure: difference                        0.188   0.388      5.7   0.0533
+    density diffusion: none                      failed            6.9   0.1150
+    density diffusion: 0.1                      0.188   0.403      7.1   0.1069
+    density diffusion: 0.4                      0.183   0.390      8.2   0.0921
+    density diffusion: corrected                0.187   0.381      6.7   0.1137
+    bulk damping: none                          0.185   0.383      5.9   0.1138
+    bulk damping: 1.0                           0.185   0.388      5.9   0.0900
+    artificial viscosity: 0.02                  0.196   0.404      6.6   0.1026
+    artificial viscosity: 0.1                   0.258   0.535      6.6   0.1125
+    laminar viscosity: none                     0.187   0.391      6.1   0.1975
+    shifting: none                              0.223   0.499      6.2   0.4960
+    shifting: 0.5, local speed                  0.214   0.486      5.4   0.4388
+    shifting: 1                                 0.195   0.420      7.5   0.3080
+    shifting: 8                                 0.187   0.383      6.9   0.0656
+    courant: 0.35                               0.185   0.388      6.9   0.0971
+    courant: 0.7                                0.185   0.391      5.0   0.1063
+    transfer: plain fetch                       0.250   0.391      6.0
+    transfer: velocities not projected          0.186   0.388      6.7
+    seeding: not packed                         0.184   0.379      5.6
+    XSPH: positions, 0.2                        0.185   0.391      6.7   0.1019
+    order: thesis                               0.258   0.953      6.7   0.4839
+    order: verlet                               0.186   0.392      7.0   0.0996
+    order: predictor_corrector                  0.186   0.391      6.0   0.1009
+    wall: potential                             3.288   5.085      5.8
+    wall: complete, free slip                   0.190   0.392      5.3
+    valve: flat reservoir                       0.229   0.525      6.1
+    valve: volume not held                      0.185   0.382      5.8
+    valve: run-out of 3                         0.188   0.392      6.7
+    valve: pressure source                      0.729   0.887      6.0
+    valve: shut                                 0.377   0.704      3.3
 
-What the preset owes its accuracy to: reservoirs with the field's own profile, complete kernels at the wall, density
-diffusion (it fails without), little artificial viscosity, shifting. What a rival does better on both flows at no cost:
-h = 1.6, a sound speed of 3.5 m/s, and above all shifting of strength 4 by the largest speed (40 ms: .473 to .404). Bulk
-damping, form of the pressure and order of the steps hardly matter here, except that "difference" is unstable at 40 ms.
+What the preset owes its accuracy to: reservoirs with the field's own profile, complete kernels at the wall, strong
+shifting by the largest speed (40 ms: .486 to .389 against the weak local one), no artificial viscosity (.535 at 0.1),
+density diffusion (it fails without), and the lost detail carried on (10 ms: .250 without). Kernel, pressure form, bulk
+damping, XSPH, order of the steps and packing hardly matter here. The first row's seconds hold the making of the wall
+fields; the incompressible scheme takes three quarters of the time, is better after 40 ms and worse after 10.
 """
 
 import argparse

@@ -25,7 +25,7 @@ import os
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
@@ -33,8 +33,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 import torch
 
 import geometry
-from torchsph import PotentialWall, Scene, Simulator, WeaklyCompressible, skill, validation
+from torchsph import PotentialWall, Scene, Simulator, WeaklyCompressible, preset, skill, validation
 from torchsph.data import sample_truth
+from torchsph.presets import Scheme
 from torchsph.validation_runs import channel, channel_error, kinetic_energy, taylor_green, taylor_green_error
 
 DECAY_TIME = 100 / (8 * math.pi**2)
@@ -50,14 +51,14 @@ class Flow:
     """One flow: how a run is made, its resolutions, and what is varied.
 
     Attributes:
-        measure: (resolution, options, backend, quick) -> error, CPU seconds, wall seconds, particle steps.
-        base: changes of the default preset that all curves share but "default preset".
-        sizes, quick: resolutions. curves: name -> changes beyond ``base``.
+        measure: (resolution, scheme, backend, quick) -> error, CPU seconds, wall seconds, particle steps.
+        base: the scheme that the curves change; presets stand beside it.
+        sizes, quick: resolutions. curves: name -> changes of ``base``.
         unit: of the resolution.
     """
 
-    measure: Callable[[float, dict, str, bool], tuple[float, float, float, float]]
-    base: dict[str, object]
+    measure: Callable[[float, Scheme, str, bool], tuple[float, float, float, float]]
+    base: WeaklyCompressible
     sizes: tuple[float, ...]
     quick: tuple[float, ...]
     curves: dict[str, dict[str, object]]
@@ -73,9 +74,9 @@ def timed(action: Callable[[], float]) -> tuple[float, float, float]:
     return error, time.process_time() - cpu, time.perf_counter() - wall
 
 
-def plane(resolution: float, options: dict, backend: str, quick: bool) -> tuple[float, float, float, float]:
+def plane(resolution: float, scheme: Scheme, backend: str, quick: bool) -> tuple[float, float, float, float]:
     """Taylor-Green in the plane."""
-    run = taylor_green(int(resolution), scheme=WeaklyCompressible(**options), backend=backend)
+    run = taylor_green(int(resolution), scheme=scheme, backend=backend)
 
     def action() -> float:
         run.advance(DECAY_TIME / 5 if quick else DECAY_TIME)
@@ -84,9 +85,9 @@ def plane(resolution: float, options: dict, backend: str, quick: bool) -> tuple[
     return *timed(action), run.particles.count * int(run.record.steps)
 
 
-def space(resolution: float, options: dict, backend: str, quick: bool) -> tuple[float, float, float, float]:
+def space(resolution: float, scheme: Scheme, backend: str, quick: bool) -> tuple[float, float, float, float]:
     """Taylor-Green in space."""
-    run = taylor_green(int(resolution), dimension=3, scheme=WeaklyCompressible(**options), backend=backend)
+    run = taylor_green(int(resolution), dimension=3, scheme=scheme, backend=backend)
 
     def action() -> float:
         worst = 0.0
@@ -98,9 +99,9 @@ def space(resolution: float, options: dict, backend: str, quick: bool) -> tuple[
     return *timed(action), run.particles.count * int(run.record.steps)
 
 
-def poiseuille(resolution: float, options: dict, backend: str, _: bool) -> tuple[float, float, float, float]:
+def poiseuille(resolution: float, scheme: Scheme, backend: str, _: bool) -> tuple[float, float, float, float]:
     """Start-up of plane Poiseuille flow."""
-    run = channel("poiseuille", int(resolution), scheme=WeaklyCompressible(**options), backend=backend)
+    run = channel("poiseuille", int(resolution), scheme=scheme, backend=backend)
 
     def action() -> float:
         run.advance(0.5)
@@ -109,7 +110,7 @@ def poiseuille(resolution: float, options: dict, backend: str, _: bool) -> tuple
     return *timed(action), run.particles.count * int(run.record.steps)
 
 
-def ventricle(resolution: float, options: dict, backend: str, quick: bool) -> tuple[float, float, float, float]:
+def ventricle(resolution: float, scheme: Scheme, backend: str, quick: bool) -> tuple[float, float, float, float]:
     """Forecasts of the sample recording 20 ms ahead; ``resolution`` is the spacing in mm."""
     recording = geometry.read_recording(str(sample_truth()))
     steps = 0.0
@@ -117,7 +118,7 @@ def ventricle(resolution: float, options: dict, backend: str, quick: bool) -> tu
     def action() -> float:
         nonlocal steps
         scene = Scene.from_recording(recording, 1e-3 * resolution)
-        model = Simulator(scene, WeaklyCompressible(**options), backend=backend)
+        model = Simulator(scene, scheme, backend=backend)
         result = skill(recording, model, (0.02,), every=recording.frames if quick else 12)
         steps = model.start(float(recording.time[0])).particles.count * float(result.info["steps"])
         return result.leads[0]["nrmse"]["model"]
@@ -125,25 +126,27 @@ def ventricle(resolution: float, options: dict, backend: str, quick: bool) -> tu
     return *timed(action), steps
 
 
+# the incompressible scheme's longest step is one for the heart; here the flow's own speed limits it
+PRESET_CURVES = {"default preset": preset("default"), "projection": preset("projection", max_step=None)}
 REFERENCE = {"reference backend": {"backend": "reference"}}
 FLOWS = {
-    "plane": Flow(plane, validation.PERIODIC_OPTIONS, (20, 40, 60), (16, 24), {
+    "plane": Flow(plane, WeaklyCompressible(**validation.PERIODIC_OPTIONS), (20, 40, 60), (16, 24), {
         "options for periodic flows": {}, "sound speed 20": {"sound_speed": 20.0},
         "sound speed 7": {"sound_speed": 7.0},
         "quintic, h = 1.5": FINER, "Wendland C4, h = 2.4": SMOOTHER, "h = 1.6": {"smoothing_ratio": 1.6},
         "predictor-corrector": {"order": "predictor_corrector"}, "symplectic Euler": {"order": "symplectic"},
     } | REFERENCE, "relative L2 velocity error"),
-    "space": Flow(space, validation.PERIODIC_OPTIONS_3D, (16, 20, 24), (16,), {
+    "space": Flow(space, WeaklyCompressible(**validation.PERIODIC_OPTIONS_3D), (16, 20, 24), (16,), {
         "options for periodic flows": {}, "sound speed 20": {"sound_speed": 20.0},
         "Wendland C4, h = 2.2": SMOOTHER | {"smoothing_ratio": 2.2}, "h = 1.4": {"smoothing_ratio": 1.4},
         "shifting 8": {"shifting": 8.0},
     }, "error of the kinetic energy"),
-    "channel": Flow(poiseuille, validation.CHANNEL_OPTIONS, (10, 20, 40), (10, 20), {
+    "channel": Flow(poiseuille, WeaklyCompressible(**validation.CHANNEL_OPTIONS), (10, 20, 40), (10, 20), {
         "options for channels": {}, "sound speed 20": {"sound_speed": 20.0}, "Wendland C4, h = 2.4": SMOOTHER,
         "h = 1.3": {"smoothing_ratio": 1.3}, "position Verlet": {"order": "verlet"},
         "potential wall": {"wall": PotentialWall()},
     } | REFERENCE, "RMS error / largest velocity"),
-    "ventricle": Flow(ventricle, {}, (2.0, 1.5, 1.2), (2.5,), {
+    "ventricle": Flow(ventricle, preset("default"), (2.0, 1.5, 1.2), (2.5,), {
         "sound speed 3.5": {"sound_speed": 3.5}, "sound speed 10": {"sound_speed": 10.0},
         "Wendland C4, h = 1.6": {"kernel": "wendland_c4", "smoothing_ratio": 1.6}, "h = 1.6": {"smoothing_ratio": 1.6},
         "position Verlet": {"order": "verlet"},
@@ -156,13 +159,13 @@ def measured(name: str, flow: Flow, quick: bool) -> list[dict]:
     sizes = flow.quick if quick else flow.sizes
     flow.measure(sizes[0], flow.base, "auto", True)  # loads the kernels outside the clock
     rows = []
-    for curve, changes in {"default preset": None, **flow.curves}.items():
-        options = {} if changes is None else {k: v for k, v in changes.items() if k != "backend"}
-        if changes is not None:
-            options = flow.base | options
-        backend = "auto" if changes is None else changes.get("backend", "auto")
+    for curve, changes in {**PRESET_CURVES, **flow.curves}.items():
+        backend, scheme = "auto", changes
+        if isinstance(changes, dict):
+            backend = changes.get("backend", "auto")
+            scheme = replace(flow.base, **{k: v for k, v in changes.items() if k != "backend"})
         for size in sizes[:1] if curve in flow.slow and backend == "reference" else sizes:
-            error, cpu, wall, steps = flow.measure(size, options, backend, quick)
+            error, cpu, wall, steps = flow.measure(size, scheme, backend, quick)
             rows.append({
                 "flow": name, "curve": curve, "resolution": size, "error": error, "cpu_s": cpu, "wall_s": wall,
                 "step_per_s": steps / cpu,
