@@ -12,12 +12,12 @@ wall seconds are those of the steps alone, for the ventricle of the whole foreca
 
 --quick takes coarse resolutions and, in the plane and in space, a fifth of the time: under a minute.
 
-Measured (results/speed_error.json and .png): in the plane 1.1 % in 0.7 CPU seconds (40^2) and 0.6 % in 1.4 (60^2). There
-0.7 of the speed of sound costs 0.7 and is no worse; a narrower kernel or twice the speed of sound is slower and worse,
-also in space. In space the incompressible scheme is as good as the options for periodic flows at a quarter of the time
-(24^3: 1.4 % in 1.2 s against 1.7 % in 5.6 s); in the plane it is behind. In the ventricle both schemes lie on one line,
-.18 and .20 in 3 s at 1.2 mm. The default preset, made for the ventricle, is poor for vortices in a periodic box (16 % at
-40^2: its shifting leaves disorder there). PySPH's vortex: peers_vortex.py.
+Measured (results/speed_error.json and .png): in the plane 1.1 % in 0.7 CPU seconds (40^2) and 0.6 % in 1.4 (60^2).
+There 0.7 of the speed of sound costs 0.7 and is no worse; a narrower kernel or twice the speed of sound is slower and
+worse, also in space. In space the incompressible scheme is as good as the options for periodic flows at a quarter of
+the time (24^3: 1.4 % in 1.2 s against 1.7 % in 5.6 s); in the plane it is behind. In the ventricle both schemes lie
+on one line, .18 and .20 in 3 s at 1.2 mm. The default preset, made for the ventricle, is poor for vortices in a
+periodic box (16 % at 40^2: its shifting leaves disorder there). PySPH's vortex: peers_vortex.py.
 """
 
 import argparse
