@@ -108,7 +108,7 @@ class Neighbourhood:
     def _without_thrust(self, push: Tensor) -> Tensor:
         """``push`` (N, D) without its mean: pressure inside a fluid that touches nothing cannot move it as a whole.
 
-        The gradient by differences is exact for linear pressures but, unlike the symmetric one, not antisymmetric.
+        The gradient by differences is exact for a constant pressure but, unlike the symmetric one, not antisymmetric.
         """
         p = self.particles
         mass = p.per_member(p.mass, "sum").clamp_min(_TINY)
