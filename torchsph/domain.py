@@ -97,6 +97,18 @@ class Domain:
                 volume *= length / (vertices[:, axis].max() - vertices[:, axis].min())
         return volume
 
+    def filling(self, particles: Particles, time: float) -> Tensor:
+        """Volume of the particles inside over that of the walls, or of the periodic box, (members,) float64.
+
+        0 where nothing encloses them.
+        """
+        inside = particles.per_member((particles.mass * particles.inside).double(), "sum")
+        if self.walls is not None:
+            return inside * self.units.length**particles.dimension / self.fluid_volume(time)
+        if self.period is not None:
+            return inside / self.period.double().prod()
+        return torch.zeros_like(inside)
+
     def breaks(self, start: float, stop: float) -> list[float]:
         """The times in (start, stop] at which members meet: key frames, valve events, and ``stop``."""
         times = {stop}
@@ -250,8 +262,7 @@ class Domain:
         if wall is not None:
             beyond = (wall.distance < -_OUTSIDE) & particles.fluid
             record.outside = particles.per_member(beyond.to(torch.int64), "sum")
-            inside = particles.per_member((particles.mass * particles.inside).double(), "sum")
-            record.filling = inside * self.units.length**particles.dimension / self.fluid_volume(time)
+            record.filling = self.filling(particles, time)
 
     def imposed(self, particles: Particles, grid: Grid, velocity: Tensor, mask: Tensor, time: float) -> Particles:
         """Particles with the velocity of a grid field, continued beyond its mask by the walls' velocity."""

@@ -32,6 +32,7 @@ class LookUp:
         self.channels, self.steady = early.shape[0], early is late
         self._rows = [rows_of(field) for field in ([early] if self.steady else [early, late])]
         self._plain = None if plain is None or early.is_cuda else _cells_above(torch.minimum(early[0], late[0]), plain)
+        self._function = _compiled_function(self._rows[0])
         self._both: Tensor | None = None  # both moments side by side, for torch
         self._counts = grid.shape[::-1]
         self._origin = [value / unit for value in grid.origin]
@@ -43,19 +44,17 @@ class LookUp:
 
         Beyond the grid its edge continues; a point that is not finite gets values that are not finite.
         """
-        plain = not (torch.is_grad_enabled() and any(t.requires_grad for t in (points, fraction, *self._rows)))
-        if plain and points.device.type == "cpu" and points.dtype in _REALS and points.dtype == self._rows[0].dtype:
-            try:
-                return self._compiled(library().function("look_up", _REALS[points.dtype]), points, fraction)
-            except LibraryMissing:
-                pass
+        derived = torch.is_grad_enabled() and any(t.requires_grad for t in (points, fraction, *self._rows))
+        alike = points.device.type == "cpu" and points.dtype == self._rows[0].dtype
+        if self._function is not None and alike and not derived:
+            return self._compiled(points, fraction)
         return self._by_torch(points, fraction)
 
-    def _compiled(self, function: ctypes._CFuncPtr, points: Tensor, fraction: Tensor) -> Tensor:
+    def _compiled(self, points: Tensor, fraction: Tensor) -> Tensor:
         points, fraction = points.contiguous(), fraction.to(points.dtype).contiguous()
         out = points.new_empty((points.shape[0], self.channels))
         triple, dimension = ctypes.c_double * 3, points.shape[1]
-        function(ctypes.byref(LookUpArguments(
+        self._function(ctypes.byref(LookUpArguments(
             dimension=dimension, threads=torch.get_num_threads(), channels=self.channels, count=points.shape[0],
             fractions=fraction.numel(), early=self._rows[0].data_ptr(),
             late=None if self.steady else self._rows[1].data_ptr(),
@@ -91,6 +90,16 @@ class LookUp:
         first = self._along(axis - 1, node, share, strides)
         second = self._along(axis - 1, node + strides[axis], share, strides)
         return torch.lerp(first, second, share[:, axis : axis + 1])
+
+
+def _compiled_function(rows: Tensor) -> ctypes._CFuncPtr | None:
+    """Compiled look-up for rows of this type and place; None where there is none, and torch has to do."""
+    if rows.device.type != "cpu" or rows.dtype not in _REALS:
+        return None
+    try:
+        return library().function("look_up", _REALS[rows.dtype])
+    except LibraryMissing:
+        return None
 
 
 def _cells_above(value: Tensor, bound: float) -> Tensor:

@@ -21,7 +21,7 @@ from .terms import shifting_displacement, softened_share
 from .walls import SMALLEST_SHARE, WallSample, completed, friction
 
 if TYPE_CHECKING:
-    from .simulator import Simulator
+    from .domain import Domain
 
 # densities that a source can react to: what is denser or thinner by more is a fault of another kind
 _LARGEST_EXCESS = 0.3
@@ -161,19 +161,11 @@ def packing(around: Neighbourhood, *, tolerance: float = 3e-2, iterations: int =
     return move * (_LARGEST_MOVE / length.clamp_min(_LARGEST_MOVE)), excess
 
 
-def check_filled(simulator: Simulator, particles: Particles, time: float) -> None:
+def check_filled(scheme: Projection, domain: Domain, particles: Particles, time: float) -> None:
     """ValueError where fluid does not fill its walls, or its box, though the scheme knows of no free surface."""
-    scheme, domain = simulator.scheme, simulator.domain
     if scheme.surface is not None or particles.count == 0:
         return
-    if domain.walls is not None:
-        volume = domain.fluid_volume(time) / simulator.scene.spacing**particles.dimension
-    elif domain.period is not None and bool(torch.isfinite(domain.period).all()):
-        volume = float(domain.period.prod())
-    else:
-        volume = float("inf")
-    inside = torch.where(particles.inside, particles.mass, torch.zeros_like(particles.mass))
-    filling = float(particles.per_member(inside, "sum").min()) / volume
+    filling = float(domain.filling(particles, time).min())
     if filling < _LEAST_FILLING:
         raise ValueError(
             f"the particles fill {100 * filling:.0f} % of what encloses them, so the fluid has a free surface: give "
@@ -233,14 +225,14 @@ class ProjectionStepper:
         )
         self._account(found, step)
         velocity = particles.velocity + push
-        held = per_particle(torch.where(found.converged, step, torch.zeros_like(step)), particles.member)
-        pressure = found.values / torch.where(held > 0, held, torch.ones_like(held)) * (held > 0)
+        # what has not converged is no start for the next solve
+        per_step = torch.where(dt > 0, 1.0 / dt.clamp_min(torch.finfo(dt.dtype).tiny), torch.zeros_like(dt))
+        pressure = found.values * per_step * found.converged.index_select(0, particles.member)
         particles = particles.changed(velocity=velocity, pressure=pressure)
         drift = dt[:, None] * velocity
         if crowding is not None:
             drift = drift + self._shifted(particles, crowding, step)
-        waiting = torch.where(dt > 0, 1.0 / dt.clamp_min(torch.finfo(dt.dtype).tiny), torch.zeros_like(dt))
-        acceleration = (velocity - before) * waiting[:, None]
+        acceleration = (velocity - before) * per_step[:, None]
         return particles.changed(position=particles.position + drift), acceleration, wall
 
     def _without_pressure(

@@ -46,21 +46,23 @@ class Reservoirs:
         self.flat = domain.scheme.valve.profile == "flat"
         self.length = float(np.ceil(domain.support_radius) + 1.0)
         self.run_out = domain.scheme.valve.run_out
-        self.times, self.flux, self.volume = self._tables()
         self.relaxation = domain.scheme.valve.relaxation
+        self.times, self.flux, self.volume = self._tables()
         labels = {valve.region: number for number, valve in enumerate(self.valves)}
         # a region may consist of several openings; each has a buffer of its own
         self.openings = [one for one in orifices(self.motion) if one.label in labels]
         self.valve_of = [labels[one.label] for one in self.openings]
         self._frames: dict[tuple[int, int], _Frame] = {}
 
-    def _tables(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Times, dV/dt and V of the cavity, internal but for the times (s)."""
+    def _tables(self) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+        """Times (s), dV/dt and V of the cavity, internal; V is None where the particles' volume is not held to it."""
         key = np.asarray(self.motion.time)
         share = np.arange(_FLUX_SAMPLES) / _FLUX_SAMPLES
         times = np.append((key[:-1, None] + share * np.diff(key)[:, None]).ravel(), key[-1])
         unit = self.units.length**self.motion.dimension
         rate = np.array([self.motion.volume_rate(t) for t in times]) * (self.units.time / unit)
+        if self.relaxation is None:
+            return times, rate, None
         return times, rate, np.array([self.motion.volume(t) for t in times]) / unit
 
     def _looked_up(self, table: np.ndarray, times: Tensor, dtype: torch.dtype | None = None) -> Tensor:

@@ -85,11 +85,17 @@ def seed_particles(simulator: Simulator, time: float, generator: torch.Generator
     return packed(simulator, resting, time, seeding.packings)
 
 
+def _neighbours(simulator: Simulator) -> tuple[Support, PairSearch]:
+    """The scheme's kernel and a search for its neighbours."""
+    scheme = simulator.scheme
+    support = Support(kernel(scheme.kernel), scheme.smoothing_ratio, simulator.scene.dimension)
+    backend = choose_backend(simulator.backend, simulator.device)
+    return support, PairSearch(backend, support.radius, 0.5, simulator.domain.period)
+
+
 def packed(simulator: Simulator, particles: Particles, time: float, times: int) -> Particles:
     """Particles whose number density is evened out, the channels of valves that are open at ``time`` (s) included."""
-    domain, scheme = simulator.domain, simulator.scheme
-    support = Support(kernel(scheme.kernel), scheme.smoothing_ratio, particles.dimension)
-    search = PairSearch(choose_backend(simulator.backend, simulator.device), support.radius, 0.5, domain.period)
+    domain, (support, search) = simulator.domain, _neighbours(simulator)
     domain.enter(time, time)
     particles = domain.prepare(particles)
     for _ in range(times):
@@ -195,18 +201,14 @@ def _quiet(
 
 def relaxed(simulator: Simulator, position: Tensor, mass: float, sweeps: int) -> Tensor:
     """Move particles of volume ``mass`` (internal) down the gradient of their crowding, kept off the walls."""
-    scheme = simulator.scheme
-    support = Support(kernel(scheme.kernel), scheme.smoothing_ratio, position.shape[1])
-    search = PairSearch(
-        choose_backend(simulator.backend, simulator.device), support.radius, 0.5, simulator.domain.period
-    )
+    support, search = _neighbours(simulator)
     for _ in range(sweeps):
         particles = _resting(position, torch.full_like(position[:, 0], mass))
         state: PairState = particles.state(particles.deviation)
         terms = RateTerms(continuity=None, concentration=True)
         crowding = search.backend.rates(search.at(particles), state, support, terms).concentration
         wall = simulator.domain.sample_at(position)
-        move = -0.15 * scheme.smoothing_ratio**2 * (crowding - wall.share_gradient)
+        move = -0.15 * support.length**2 * (crowding - wall.share_gradient)
         length = move.norm(dim=1, keepdim=True)
         position = position + move * (_LARGEST_MOVE / length.clamp_min(_LARGEST_MOVE))
         wall = simulator.domain.sample_at(position)

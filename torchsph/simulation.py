@@ -61,7 +61,7 @@ class Simulation:
         search = PairSearch(self._backend, self.domain.support_radius, _SEARCH_MARGIN, self.domain.period)
         buffered = self.domain.reservoirs is not None
         if isinstance(scheme, Projection):
-            check_filled(simulator, particles, self.time)
+            check_filled(scheme, self.domain, particles, self.time)
             self._stepper = ProjectionStepper(scheme, self._coefficients, search, scene.dimension, self.record)
         else:
             self._stepper = Stepper(scheme, self._coefficients, search, scene.dimension, buffered=buffered)
@@ -325,17 +325,14 @@ class Simulation:
 
     def fetch(self, grid: Grid, mask: Tensor) -> Fetched:
         """Velocities at the nodes where ``mask`` (*shape): value (members, D, *shape), covered (members, *shape)."""
-        return self._fetched(grid, mask, self.particles.velocity * self.units.speed)
-
-    def _fetched(self, grid: Grid, mask: Tensor, carried: Tensor) -> Fetched:
         p = self.particles
         node = torch.nonzero(mask.reshape(-1)).squeeze(1)
         points = grid.nodes(dtype=torch.float64, device=p.position.device)[node] / self.units.length
         points = points.to(p.position.dtype).repeat(self.members, 1)
         owner = torch.arange(self.members, device=p.member.device).repeat_interleave(len(node))
         found = fetch_at(
-            self._backend, points, owner, p.position, p.member, carried, FETCH_RADIUS, period=self.domain.period,
-            weight=p.confidence,
+            self._backend, points, owner, p.position, p.member, p.velocity * self.units.speed, FETCH_RADIUS,
+            period=self.domain.period, weight=p.confidence,
         )
         dimension = grid.dimension
         value = p.velocity.new_zeros((self.members, dimension, grid.size))
