@@ -81,7 +81,8 @@ class Neighbourhood:
     ) -> tuple[Tensor, PoissonSolution]:
         """Solve -laplacian(u) = ``source`` (N,); minus the gradient of u (N, D), 0 in reservoirs, and the solution.
 
-        Walls and buffers are impermeable to u (Neumann); where ``surface`` (N,) bool u is 0.
+        The solution is continued into reservoirs. Walls and buffers are impermeable to u (Neumann); where ``surface``
+        (N,) bool u is 0.
         """
         p, backend = self.particles, self.search.backend
         state, fluid = p.state(p.deviation), p.fluid
@@ -100,7 +101,8 @@ class Neighbourhood:
             whole = problem.total(torch.where(fluid, p.mass, torch.zeros_like(source)))
             found = replace(found, mismatch=found.mismatch * whole / part.clamp_min(_TINY))
         terms = MomentumTerms(pressure="difference")
-        slope = backend.momentum(self.pairs, p.state(self._continued(found.values)), self.support, terms)
+        found = replace(found, values=self._continued(found.values))
+        slope = backend.momentum(self.pairs, p.state(found.values), self.support, terms)
         slope = slope / self.share[:, None] if self.wall is not None else slope
         slope = torch.where(fluid[:, None], slope, torch.zeros_like(slope))
         return (slope if self.wall is not None else self._without_thrust(slope)), found
@@ -194,6 +196,11 @@ class ProjectionStepper:
             concentration=coefficients.shifting is not None,
             shepard=self.scheme.relaxation is not None or self.scheme.surface is not None,
         )
+
+    @staticmethod
+    def pressure(particles: Particles) -> Tensor:
+        """p / rho0 (N,) of the last projection; 0 before the first."""
+        return torch.zeros_like(particles.mass) if particles.pressure is None else particles.pressure
 
     def step(
         self, particles: Particles, step: Tensor, number: Tensor, around: Surroundings

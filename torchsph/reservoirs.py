@@ -9,6 +9,7 @@ its share of the profile, and is removed at the far end.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -19,6 +20,7 @@ from geometry import OrificePlane, orifices
 
 from .particles import CHANNEL, FLUID, RESERVOIR, Particles
 from .record import Record
+from .work import carried_energy, energy_unit
 
 if TYPE_CHECKING:
     from .domain import Domain
@@ -47,6 +49,7 @@ class Reservoirs:
         self.length = float(np.ceil(domain.support_radius) + 1.0)
         self.run_out = domain.scheme.valve.run_out
         self.relaxation = domain.scheme.valve.relaxation
+        self._energy = energy_unit(self.units, domain.scene.fluid.density, self.motion.dimension)
         self.times, self.flux, self.volume = self._tables()
         labels = {valve.region: number for number, valve in enumerate(self.valves)}
         # a region may consist of several openings; each has a buffer of its own
@@ -212,7 +215,9 @@ class Reservoirs:
         scale = torch.where(flat, speed, speed / mean.clamp_min(1e-5))
         return torch.where(flat[owner], ones, shape) * scale[owner]
 
-    def exchange(self, particles: Particles, record: Record) -> tuple[Particles, bool]:
+    def exchange(
+        self, particles: Particles, record: Record, pressure: Callable[[Particles], Tensor]
+    ) -> tuple[Particles, bool]:
         """Turn particles that have crossed an open orifice into the other kind; feed and clear the far ends."""
         kind, gone, fresh = particles.kind, torch.zeros_like(particles.fluid), []
         for number, frame in self._active():
@@ -229,11 +234,16 @@ class Reservoirs:
             kind = torch.where(entered, torch.full_like(kind, FLUID), kind)
             gone |= beyond & (height > lead + self.length)
             valve, unit = self.valve_of[number], self.units.length**self.motion.dimension
-            for counter, volume, which in (
-                (record.inserted, record.inflow, entered), (record.removed, record.outflow, out),
+            for counter, volume, energy, which in (
+                (record.inserted, record.inflow, record.energy_in, entered),
+                (record.removed, record.outflow, record.energy_out, out),
             ):
-                counter[:, valve] += particles.per_member(which.to(torch.int64), "sum")
-                volume[:, valve] += particles.per_member((particles.mass * which).double(), "sum") * unit
+                if not bool(which.any()):
+                    continue
+                some = particles.select(which)
+                counter[:, valve] += some.per_member(torch.ones_like(some.member), "sum")
+                volume[:, valve] += some.per_member(some.mass.double(), "sum") * unit
+                energy[:, valve] += some.per_member(carried_energy(some, pressure(some)), "sum") * self._energy
         particles = particles.changed(kind=kind)
         if not fresh and not bool(gone.any()):
             return particles, False
