@@ -33,8 +33,12 @@ from .observing import Seen, Source
 from .perturbations import flow_perturbations
 from .regions import flow_regions
 from .smooth import FrameSmoother
+from .solenoidal import without_divergence
+from .ultrasound.fields import fwhm_to_deviation
 
 INCREMENTS = ("spline", "ensemble")
+# share of the forecast's error variance that an analysis leaves at least
+_LEAST_LEFT = 0.25
 
 
 @dataclass(frozen=True)
@@ -69,10 +73,13 @@ class EnsembleOptions:
     Attributes:
         model_error: RMS per component of the perturbations added to every forecast, share of the RMS of the control
             or of all splines, whichever is larger.
-        length: their correlation length, in mean grid spacings.
+        length: deviation (m) of the Gaussian that smooths them; None: that of the measurement's kernel, because nothing
+            finer is corrected by it, and at least a grid spacing.
         localisation: radius at which observations lose all influence, share of the walls' longest extent.
         relaxation: RTPS factor. gross_error: rejection limit in expected standard deviations, or None.
-        increments: what the analysis is put together from: "spline", "ensemble" or both.
+        increments: what the estimate's analysis is put together from: "spline", "ensemble" (the filter's) or both. The
+            members' anomalies are the filter's in any case. On the phantom the spline alone did as well as both
+            (NRMSE .30 and .30 of the flow in filling, .41 and .45 over a beat at two noise levels) and costs less.
         choose_every: frames after which the smoothness of the innovations is chosen anew.
         memory: cycles over which gains and error scales are averaged.
         kernel: full width at half maximum (m) of the measurements' resolution; None: as their noise shows it.
@@ -81,11 +88,11 @@ class EnsembleOptions:
     """
 
     model_error: float = 0.2
-    length: float = 2.0
+    length: float | None = None
     localisation: float = 0.33
     relaxation: float = 0.5
     gross_error: float | None = 5.0
-    increments: tuple[str, ...] = INCREMENTS
+    increments: tuple[str, ...] = ("spline",)
     choose_every: int = 3
     memory: float = 8.0
     kernel: float | None = None
@@ -94,7 +101,7 @@ class EnsembleOptions:
 
     def __post_init__(self) -> None:
         for name in ("length", "localisation", "choose_every"):
-            if not getattr(self, name) > 0:
+            if getattr(self, name) is not None and not getattr(self, name) > 0:
                 raise ValueError(f"EnsembleOptions.{name} must be positive, got {getattr(self, name)}")
         for name in ("model_error", "relaxation"):
             if not 0 <= getattr(self, name) <= 1:
@@ -201,7 +208,9 @@ class Cycle:
     # --- forecast -------------------------------------------------------------------------------------
 
     def _perturbations(self, frame: int, amplitude: float) -> Tensor:
-        length = self.options.length * float(np.mean(self.grid.spacing))
+        length = self.options.length
+        if length is None:
+            length = max(fwhm_to_deviation(self.sources[0].kernel), float(np.mean(self.grid.spacing)))
         return flow_perturbations(
             self.count, np.array(self.measured.mask[frame], bool), self.grid.spacing, amplitude, length, self.generator
         ).to(torch.float32)
@@ -289,10 +298,12 @@ class Cycle:
         self.scale.learn(analysis, look.observations, look.group)
         control = state.control + change
         anomalies, parameters = self._on_grid(analysis.ensemble[:, :size] - analysis.mean[:size], inside), {}
+        left = self._left(look, self._seen(anomalies, masks, look), self._seen(change[None], masks, look)[0], weight)
+        anomalies = left * anomalies
         if state.parameters:
             _, parameters = self.augmentation.split(analysis.ensemble)
         self.ensemble = Ensemble(control, control + anomalies, parameters)
-        sigma = self._on_grid(analysis.variance[:size].clamp_min(0).sqrt()[None], inside)[0]
+        sigma = left * self._on_grid(analysis.variance[:size].clamp_min(0).sqrt()[None], inside)[0]
         self._keep(torch.where(mask, control, 0.0), sigma, missing)
 
     def _weights(self, analysis: Analysis, look: Look) -> Tensor:
@@ -324,6 +335,18 @@ class Cycle:
                 whole = self._spline_of(innovation, self._weights(analysis, look), look, frame)
             found.append(torch.diag_embed(whole.movedim(0, -1)).movedim((-2, -1), (0, 1)))
         return torch.cat(found)
+
+    def _left(self, look: Look, anomalies: Tensor, change: Tensor, weight: Tensor) -> float:
+        """Factor on the analysed anomalies, seen (N, m), that leaves them what the analysis left of the error.
+
+        With weights that make the innovations white the error's variance falls by the increment's own; the filter
+        believes that it did more, because it takes its own increment for the one that was followed.
+        """
+        before = float((weight * look.members.double().var(0)).nan_to_num().sum())
+        after = float((weight * anomalies.double().var(0)).sum())
+        taken = float((weight * change.double().square()).sum())
+        target = max(before - taken, _LEAST_LEFT * before)
+        return (target / after) ** 0.5 if after > 0 else 1.0
 
     def _match_spread(self, masks: list[Tensor], look: Look, weight: Tensor, frame: int) -> None:
         """Compare what the spline finds in the innovations with what it finds in one draw from the ensemble."""
@@ -396,7 +419,9 @@ class Cycle:
         return full.reshape(len(values), self.grid.dimension, *self.grid.shape)
 
     def _keep(self, control: Tensor, sigma: Tensor, missing: int) -> None:
-        self.fields.append(control.to(torch.float32))
+        mask = np.array(self.measured.mask[len(self.fields)], bool)
+        clean = without_divergence(control.numpy(), mask, self.grid.spacing)
+        self.fields.append(torch.from_numpy(clean).to(torch.float32))
         self.sigmas.append(sigma.to(torch.float32))
         self.missing.append(missing)
 

@@ -14,6 +14,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.ndimage import gaussian_filter
 from scipy.optimize import brentq
 
 import geometry
@@ -28,6 +29,7 @@ _NEAR, _FAR = 1, 3
 _NARROWEST, _WIDEST = 1.2, 6.0
 _LITTLE = 0.05
 _MOST_TRUST = 2.0
+_AROUND = 2.0  # nodes, deviation of the Gaussian that averages the residuals' level
 _MEDIAN_OF_SQUARE = 0.454936423119572
 _FWHM = 2.0 * math.sqrt(2.0 * math.log(2.0))
 
@@ -41,7 +43,8 @@ class ObservationError:
             gives ``sigma``.
         redundancy: (T,) number of nodes that carry the same error, at least 1: their variances are multiplied by it,
             so that neighbours with a common error are not counted as independent.
-        surprise: (T, *shape) factors, at least 1, on the variance of nodes that stand out from their surroundings.
+        surprise: (T, *shape) factors on the variance: more where the residuals around a node are larger than usual (in
+            shear, say), and for nodes that stand out from their surroundings.
         kernel: full width at half maximum (m) of the Gaussian that averaged the flow and coloured the noise; 0: none.
         trust: the variance goes with weight ** -trust, as the residuals show; 0 for weights that say nothing.
     """
@@ -95,6 +98,9 @@ def estimate_error(
     robust = np.maximum(robust, 1e-3 * speed + 1e-6)
     distance = np.sqrt(np.mean((residual / robust.reshape(-1, parts, *ones)) ** 2, axis=1))
     surprise = np.maximum(distance / _SURPRISING, 1.0) ** 2
+    told = measured.sigma is not None
+    if not told:
+        surprise *= np.stack([_local_level(distance[f], used[f]) for f in range(measured.frames)])
     kernel = 0.0 if float(np.median(robust)) < _LITTLE * speed else kernel_width(residual, used, measured.grid.spacing)
     redundancy = np.full(measured.frames, _nodes_of(kernel, measured.grid.spacing))
     for frame in range(measured.frames):
@@ -102,10 +108,16 @@ def estimate_error(
         if choice is not None:
             chosen = float(np.mean((np.array(choice.noise) / robust[frame]) ** 2))
             redundancy[frame] = max(redundancy[frame], chosen)
-    told = measured.sigma is not None
     trust = 0.0 if told or measured.weight is None else _trust(measured, residual / robust.reshape(-1, parts, *ones))
     deviation = None if told else np.broadcast_to(robust, (len(robust), measured.dimension)).copy()
     return ObservationError(deviation, np.maximum(redundancy, 1.0), surprise, kernel, trust)
+
+
+def _local_level(distance: np.ndarray, used: np.ndarray) -> np.ndarray:
+    """Mean square around each node (*shape) of the residuals in robust deviations, outliers cut at ``_SURPRISING``."""
+    share = gaussian_filter(used.astype(np.float64), _AROUND)
+    power = gaussian_filter(np.where(used, np.minimum(distance, _SURPRISING) ** 2, 0.0), _AROUND)
+    return np.where(used, power / np.maximum(share, 1e-6), 1.0)
 
 
 def kernel_width(residual: np.ndarray, used: np.ndarray, spacing: tuple[float, ...]) -> float:
