@@ -5,8 +5,8 @@ and an ensemble filter joins forecasts and measurements.
 """
 
 from ._version import __version__
-from .cycle import Estimated, EnsembleOptions
 from .ensemble import EnsembleRun, assimilate, default_filter
+from .ensemble_options import EnsembleOptions, Estimated
 from .forecast import ForecastSkill, GridForecast, Transfer, skill
 from .incompressible import Projection
 from .observation_error import ObservationError, estimate_error

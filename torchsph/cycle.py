@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 import geometry
-import regularize
 
 from .assimilation import (
     Analysis,
@@ -20,14 +19,13 @@ from .assimilation import (
     Filter,
     FilterRecord,
     LearnedGain,
-    Observations,
-    Parameter,
     Reason,
     SpreadMatch,
     concatenate,
     replace_failed,
 )
-from .forecast import Transfer
+from .ensemble_options import EnsembleOptions
+from .innovation_spline import InnovationSpline, Look
 from .members import Ensemble, Forecaster, Forecasts
 from .observing import Seen, Source
 from .perturbations import flow_perturbations
@@ -36,99 +34,8 @@ from .smooth import FrameSmoother
 from .solenoidal import without_divergence
 from .ultrasound.fields import fwhm_to_deviation
 
-INCREMENTS = ("spline", "ensemble")
 # share of the forecast's error variance that an analysis leaves at least
 _LEAST_LEFT = 0.25
-
-
-@dataclass(frozen=True)
-class Estimated:
-    """A parameter of the simulator that the members disagree about and the filter learns.
-
-    Attributes:
-        parameter: its name is one of ``Simulation.change``'s ("viscosity", "sound_speed", ...), with its bounds.
-        value: first guess. spread: standard deviation of the first guess in the parameter's unbounded coordinate (its
-            logarithm above a lower bound).
-    """
-
-    parameter: Parameter
-    value: float
-    spread: float
-
-    def __post_init__(self) -> None:
-        if not self.spread > 0:
-            raise ValueError(f"Estimated.spread of {self.parameter.name} must be positive, got {self.spread}")
-
-    def draw(self, members: int, generator: torch.Generator) -> Tensor:
-        """(members,) first guesses."""
-        middle = self.parameter.encode(torch.tensor([self.value], dtype=torch.float64))
-        noise = torch.randn(members, generator=generator, dtype=torch.float64)
-        return self.parameter.decode(middle + self.spread * (noise - noise.mean()))
-
-
-@dataclass(frozen=True)
-class EnsembleOptions:
-    """Settings of the cycle; lengths and speeds are relative to the scene, so that hearts of any size fit.
-
-    Attributes:
-        model_error: RMS per component of the perturbations added to every forecast, share of the RMS of the control
-            or of all splines, whichever is larger.
-        length: deviation (m) of the Gaussian that smooths them; None: that of the measurement's kernel, because nothing
-            finer is corrected by it, and at least a grid spacing.
-        localisation: radius at which observations lose all influence, share of the walls' longest extent.
-        relaxation: RTPS factor. gross_error: rejection limit in expected standard deviations, or None.
-        increments: what the estimate's analysis is put together from: "spline", "ensemble" (the filter's) or both. The
-            members' anomalies are the filter's in any case. On the phantom the spline alone did as well as both
-            (NRMSE .30 and .30 of the flow in filling, .41 and .45 over a beat at two noise levels) and costs less.
-        choose_every: frames after which the smoothness of the innovations is chosen anew.
-        memory: cycles over which gains and error scales are averaged.
-        kernel: full width at half maximum (m) of the measurements' resolution; None: as their noise shows it.
-        transfer: how grid forecasts are put together.
-        estimated: parameters of the simulator to be learned.
-    """
-
-    model_error: float = 0.2
-    length: float | None = None
-    localisation: float = 0.33
-    relaxation: float = 0.5
-    gross_error: float | None = 5.0
-    increments: tuple[str, ...] = ("spline",)
-    choose_every: int = 3
-    memory: float = 8.0
-    kernel: float | None = None
-    transfer: Transfer = Transfer()
-    estimated: tuple[Estimated, ...] = ()
-
-    def __post_init__(self) -> None:
-        for name in ("length", "localisation", "choose_every"):
-            if getattr(self, name) is not None and not getattr(self, name) > 0:
-                raise ValueError(f"EnsembleOptions.{name} must be positive, got {getattr(self, name)}")
-        for name in ("model_error", "relaxation"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise ValueError(f"EnsembleOptions.{name} must lie in [0, 1], got {getattr(self, name)}")
-        if not self.memory >= 1:
-            raise ValueError(f"EnsembleOptions.memory must be at least 1 cycle, got {self.memory}")
-        if self.kernel is not None and not self.kernel >= 0:
-            raise ValueError(f"EnsembleOptions.kernel must be None or not negative (m), got {self.kernel}")
-        if not self.increments or not set(self.increments) <= set(INCREMENTS):
-            raise ValueError(f"EnsembleOptions.increments must name some of {INCREMENTS}, got {self.increments}")
-
-
-@dataclass
-class Look:
-    """All observations of one cycle beside what control and members predict of them.
-
-    Attributes:
-        parts: (source, what it saw, index of the time at which it did).
-        observations, group: (m,) of all of them, and which learned error scale each belongs to.
-        members: (N, m) predicted. regions: masks (m,) by name.
-    """
-
-    parts: list[tuple[Source, Seen, int]]
-    observations: Observations
-    group: Tensor
-    members: Tensor
-    regions: dict[str, Tensor] = field(default_factory=dict)
 
 
 class Cycle:
@@ -155,7 +62,7 @@ class Cycle:
         self.first_group = np.cumsum([0] + [source.groups for source in self.sources]).tolist()
         self.scale = ErrorScale(self.first_group[-1], memory=options.memory)
         self.record = FilterRecord(seed=seed)
-        self.choice: regularize.Choice | None = None
+        self.spline = InnovationSpline(splines, options.choose_every)
         self.offered: Tensor | None = None  # (J, D, *shape) increments of the last analysis
         self.fields: list[Tensor] = []
         self.sigmas: list[Tensor] = []
@@ -254,9 +161,9 @@ class Cycle:
         if not parts:
             return None
         group = torch.cat([
-            self.first_group[self.sources.index(source)] + torch.arange(seen.parts).repeat_interleave(len(seen.position))
-            for source, seen, _ in parts
-        ])
+            torch.arange(seen.parts).repeat_interleave(len(seen.position))
+            + self.first_group[self.sources.index(source)] for source, seen, _ in parts
+        ])  # fmt: skip
         observations = self.scale.apply(concatenate([seen.observations for _, seen, _ in parts]), group)
         members = torch.cat([source.predict(states[k].members, masks[k], seen) for source, seen, k in parts], 1)
         return Look(parts, observations, group, members, self._regions(parts, states[-1].control, frame))
@@ -332,7 +239,7 @@ class Cycle:
                 whole = torch.where(self.mask(frame), moved - control, 0.0)
             else:
                 innovation = torch.nan_to_num(analysis.innovation)
-                whole = self._spline_of(innovation, self._weights(analysis, look), look, frame)
+                whole = self.spline.of(innovation, self._weights(analysis, look), look, frame)
             found.append(torch.diag_embed(whole.movedim(0, -1)).movedim((-2, -1), (0, 1)))
         return torch.cat(found)
 
@@ -350,7 +257,7 @@ class Cycle:
 
     def _match_spread(self, masks: list[Tensor], look: Look, weight: Tensor, frame: int) -> None:
         """Compare what the spline finds in the innovations with what it finds in one draw from the ensemble."""
-        if "spline" not in self.options.increments or self.choice is None:
+        if "spline" not in self.options.increments:
             return
         parts, first = self.grid.dimension, self.options.increments.index("spline") * self.grid.dimension
         seen = self._seen(self.offered, masks, look)
@@ -358,38 +265,8 @@ class Cycle:
         shown = float((weight * seen[first : first + parts].sum(0) * followed).sum())
         draw = torch.randn(self.count, generator=self.generator, dtype=torch.float64) / (self.count - 1) ** 0.5
         anomaly = draw @ torch.nan_to_num(look.members - look.members.mean(0)).double()
-        found = self._spline_of(anomaly, weight, look, frame, learning=True)
+        found = self.spline.of(anomaly, weight, look, frame, learning=True)
         self.spread.learn(shown, float((weight * self._seen(found[None], masks, look)[0] * anomaly).sum()))
-
-    def _spline_of(
-        self, value: Tensor, weight: Tensor, look: Look, frame: int, *, learning: bool = False
-    ) -> Tensor:
-        """(D, *shape) the penalised spline of numbers (m,) at the observations of positive weight.
-
-        ``learning``: with the noise and smoothness that are in use, which stay.
-        """
-        start, rows = 0, []
-        for _, seen, _ in look.parts:
-            m = len(seen.observations)
-            good = (weight[start : start + m].reshape(seen.parts, -1) > 0).all(0)
-            rows.append((seen, value[start : start + m].reshape(seen.parts, -1).T[good], good))
-            start += m
-        if not any(bool(good.any()) for _, _, good in rows):
-            return torch.zeros((self.grid.dimension, *self.grid.shape))
-        full = [row for row in rows if row[0].beam is None and bool(row[2].any())]
-        anew = not learning and ((frame - 1) % self.options.choose_every == 0 or self.choice is None)
-        if full:
-            points, samples, confidence = (torch.cat(each) for each in zip(*[
-                (seen.position[good], some, seen.confidence[good]) for seen, some, good in full
-            ], strict=True))
-            fitted = self.splines.fit_increment(
-                frame, points, samples, confidence, choice=None if anew else self.choice
-            )
-            self.choice = self.choice if learning else fitted.choice
-        if len(full) < sum(bool(row[2].any()) for row in rows):
-            *samples, beams = _along_beams(rows, self.grid.dimension)
-            fitted = self.splines.fit_increment(frame, *samples, beam=beams, choice=self.choice)
-        return torch.from_numpy(self.splines.on_grid(fitted, frame))
 
     def _coast(self, state: Ensemble, mask: Tensor, missing: int, time: float) -> None:
         """Nothing was measured: the forecast is the analysis."""
@@ -427,22 +304,20 @@ class Cycle:
 
     def state(self) -> dict[str, Any]:
         """Everything that the next step depends on, as tensors and plain values."""
-        choice = None if self.choice is None else asdict(self.choice)
         return {
             "ensemble": {"control": self.ensemble.control, "members": self.ensemble.members,
                          "parameters": dict(self.ensemble.parameters)},
             "generator": self.generator.get_state(), "gain": self.gain.state(), "spread": self.spread.state(),
-            "scale": self.scale.state(), "record": self.record.state(), "choice": choice, "offered": self.offered,
-            "fields": list(self.fields), "sigmas": list(self.sigmas), "missing": list(self.missing),
-            "events": list(self.events),
+            "scale": self.scale.state(), "record": self.record.state(), "spline": self.spline.state(),
+            "offered": self.offered, "fields": list(self.fields), "sigmas": list(self.sigmas),
+            "missing": list(self.missing), "events": list(self.events),
         }  # fmt: skip
 
     def restore(self, state: dict[str, Any]) -> None:
         self.ensemble = Ensemble(**state["ensemble"])
         self.generator.set_state(state["generator"])
-        for part, name in ((self.gain, "gain"), (self.spread, "spread"), (self.scale, "scale"), (self.record, "record")):
-            part.restore(state[name])
-        self.choice = None if state["choice"] is None else regularize.Choice(**state["choice"])
+        for name in ("gain", "spread", "scale", "record", "spline"):
+            getattr(self, name).restore(state[name])
         self.offered = state["offered"]
         self.fields, self.sigmas = list(state["fields"]), list(state["sigmas"])
         self.missing, self.events = list(state["missing"]), list(state["events"])
@@ -450,26 +325,3 @@ class Cycle:
 
 def _nearest(times: list[float], time: float) -> int:
     return int(np.abs(np.array(times) - time).argmin())
-
-
-def _along_beams(rows: list[tuple[Seen, Tensor, Tensor]], dimension: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Samples of all sources as components along unit vectors: points, velocities, confidences, beams.
-
-    Confidences of sources are matched by their white-equivalent deviations, redundancy included.
-    """
-    points, samples, beams, deviations = [], [], [], []
-    for seen, value, good in rows:
-        spread = (seen.observations.variance * seen.observations.redundancy).reshape(seen.parts, -1)[:, good].sqrt()
-        for part in range(seen.parts):
-            if seen.beam is None:
-                beam = torch.eye(dimension, dtype=torch.float64)[part].expand(int(good.sum()), -1)
-            else:
-                beam = seen.beam[good]
-            points.append(seen.position[good])
-            samples.append(value[:, part : part + 1] * beam)
-            beams.append(beam)
-            deviations.append(spread[part])
-    deviation = torch.cat(deviations)
-    confidence = (deviation.quantile(0.05) / deviation).clamp(1e-3, 1.0) if len(deviation) else deviation
-    beam = torch.cat(beams)
-    return torch.cat(points), torch.cat(samples), confidence, beam / beam.norm(dim=1, keepdim=True).clamp_min(1e-12)

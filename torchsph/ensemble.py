@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,15 +15,13 @@ import regularize
 
 from . import checkpoint
 from .assimilation import LETKF, RTPS, Filter, Localisation
-from .cycle import Cycle, EnsembleOptions
+from .cycle import Cycle
+from .ensemble_options import EnsembleOptions
 from .members import Forecaster
 from .observation_error import ObservationError, estimate_error
 from .observing import Source
 from .simulator import Simulator
 from .smooth import FrameSmoother, smooth_frames
-
-_INTERRUPT = "TORCHSPH_STOP_AFTER"
-"""Environment variable: leave with an error after so many cycles; for tests of checkpoints alone."""
 
 
 @dataclass(frozen=True)
@@ -91,8 +88,8 @@ def assimilate(
     sources = [Source(measured, error, measured.grid, options.kernel)]
     sources += [_other(one, measured, options, progress) for one in also]
     cycle = Cycle(
-        sources, splines, Forecaster(model, coarse, measured.grid, options.transfer, seed=seed), filter, options,
-        members=members, usual=_usual_speed(measured, splines, smoothed), truth=truth, seed=seed,
+        sources, splines, Forecaster(model, coarse, measured.grid, options.transfer, batch=options.batch, seed=seed),
+        filter, options, members=members, usual=_usual_speed(measured, splines, smoothed), truth=truth, seed=seed,
     )
     key = checkpoint.fingerprint(_identity(measured, also, model, coarse, filter, options, members, seed))
     path = None if checkpoints is None else Path(checkpoints)
@@ -104,7 +101,6 @@ def assimilate(
 
 
 def _run(cycle: Cycle, path: Path | None, key: str, progress: bool) -> None:
-    stop, steps = int(os.environ.get(_INTERRUPT, "0")), 0
     frames = range(cycle.done, cycle.measured.frames)
     for frame in tqdm(frames, desc="ensemble", unit="frame", disable=None if progress else True):
         if frame == 0:
@@ -113,9 +109,6 @@ def _run(cycle: Cycle, path: Path | None, key: str, progress: bool) -> None:
             cycle.step(frame)
         if path is not None:
             checkpoint.save(path, key, cycle.state())
-        steps += 1
-        if steps == stop:
-            raise RuntimeError(f"stopped after {stop} cycles as {_INTERRUPT} asks")
 
 
 def _other(

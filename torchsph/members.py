@@ -56,17 +56,18 @@ class Forecasts:
     steps: int
 
 
-def shares(members: int, control_cost: float, processes: int) -> list[tuple[bool, slice]]:
+def shares(members: int, control_cost: float, processes: int, batch: int = 1) -> list[tuple[bool, slice]]:
     """Who runs what: for each process whether it runs the control, and its slice of the members.
 
     The control, which costs as much as ``control_cost`` members, belongs to the first process; the members follow in
-    order, so that all processes have about the same to do.
+    order and in whole batches, so that all processes have about the same to do.
     """
-    fair = (members + control_cost) / processes
-    ends = [min(members, max(0, round((rank + 1) * fair - control_cost))) for rank in range(processes)]
-    ends[-1] = members
-    starts = [0, *ends[:-1]]
-    return [(rank == 0, slice(starts[rank], ends[rank])) for rank in range(processes)]
+    batches, cost = -(-members // batch), control_cost / batch
+    fair = (batches + cost) / processes
+    ends = [min(batches, max(0, round((rank + 1) * fair - cost))) for rank in range(processes)]
+    ends[-1] = batches
+    bounds = [min(members, batch * end) for end in [0, *ends]]
+    return [(rank == 0, slice(bounds[rank], bounds[rank + 1])) for rank in range(processes)]
 
 
 class Forecaster:
@@ -74,11 +75,17 @@ class Forecaster:
 
     Args:
         model: of the control. coarse: of the members. grid: of the state. transfer: how grid forecasts are made.
+        batch: members that are simulated together. They share the search of neighbours, whose times decide on the last
+            digits of their sums: with the same batches the same bits result, whatever process runs them.
     """
 
     def __init__(
-        self, model: Simulator, coarse: Simulator, grid: geometry.Grid, transfer: Transfer, *, seed: int = 0
+        self, model: Simulator, coarse: Simulator, grid: geometry.Grid, transfer: Transfer, *, batch: int = 8,
+        seed: int = 0,
     ) -> None:
+        if batch < 1:
+            raise ValueError(f"a batch needs at least one member, got {batch}")
+        self.batch = batch
         self.model, self.coarse, self.grid, self.transfer, self.seed = model, coarse, grid, transfer, seed
         ratio = coarse.scene.spacing / model.scene.spacing
         self.control_cost = ratio ** (grid.dimension + 1)  # so many more particles, and so much shorter steps
@@ -92,7 +99,7 @@ class Forecaster:
         """
         count = len(ensemble.members)
         rank, processes = (dist.get_rank(), dist.get_world_size()) if dist.is_initialized() else (0, 1)
-        todo = shares(count, self.control_cost, processes)
+        todo = shares(count, self.control_cost, processes, self.batch)
         lead, mine = todo[rank]
         here = (start, mask, times, masks)
         run = self._members(ensemble, mine, *here)
@@ -115,12 +122,17 @@ class Forecaster:
         masks: Sequence[Tensor],
     ) -> tuple[Tensor, int]:
         """(times, k, D, *shape) of this process's members, NaN where one failed; and the steps taken."""
-        parameters = {name: row[mine] for name, row in ensemble.parameters.items()}
-        states = ensemble.members[mine]
-        if not len(states):
-            return states.new_zeros((len(times), *states.shape)), 0
-        found, _, failed, steps = self._run(self.coarse, states, parameters, start, mask, times, masks)
-        return torch.where(failed.reshape(1, -1, *[1] * (found.ndim - 2)), torch.nan, found), steps
+        done = [ensemble.members.new_zeros((len(times), 0, *ensemble.control.shape))]
+        total = 0
+        for first in range(mine.start, mine.stop, self.batch):
+            these = slice(first, min(first + self.batch, mine.stop))
+            parameters = {name: row[these] for name, row in ensemble.parameters.items()}
+            found, _, failed, steps = self._run(
+                self.coarse, ensemble.members[these], parameters, start, mask, times, masks
+            )
+            done.append(torch.where(failed.reshape(1, -1, *[1] * (found.ndim - 2)), torch.nan, found))
+            total += steps
+        return torch.cat(done, 1), total
 
     def _control(
         self, ensemble: Ensemble, start: float, mask: Tensor, times: Sequence[float], masks: Sequence[Tensor]

@@ -26,8 +26,9 @@ _SURPRISING = 3.0
 # the lags in nodes whose differences tell the kernel's width: short enough for what is left of the flow to be smooth
 _NEAR, _FAR = 1, 3
 # widths that lags of whole nodes can tell apart, in node spacings; and the noise that is too little to show its own
-_NARROWEST, _WIDEST = 1.2, 6.0
+_NARROWEST, _WIDEST = 1.2, 5.0
 _LITTLE = 0.05
+_ABOVE = 1.5  # times the stated deviation: more is no noise
 _MOST_TRUST = 2.0
 _AROUND = 2.0  # nodes, deviation of the Gaussian that averages the residuals' level
 _MEDIAN_OF_SQUARE = 0.454936423119572
@@ -101,7 +102,11 @@ def estimate_error(
     told = measured.sigma is not None
     if not told:
         surprise *= np.stack([_local_level(distance[f], used[f]) for f in range(measured.frames)])
-    kernel = 0.0 if float(np.median(robust)) < _LITTLE * speed else kernel_width(residual, used, measured.grid.spacing)
+    left = float(np.median(robust))
+    stated = float(np.median(measured.sigma[np.repeat(used[:, None], measured.dimension, 1)])) if told else math.inf
+    # residuals that are next to nothing, or far above the noise that the file states, are the spline's, not noise
+    noisy = _LITTLE * speed < left < _ABOVE * stated
+    kernel = kernel_width(residual, used, measured.grid.spacing) if noisy else 0.0
     redundancy = np.full(measured.frames, _nodes_of(kernel, measured.grid.spacing))
     for frame in range(measured.frames):
         choice = None if measured.beam is not None else splines.choice(frame)

@@ -30,7 +30,7 @@ class LearnedGain:
     """
 
     def __init__(
-        self, increments: int, components: int = 1, *, start: float = 0.5, memory: float = 8.0, prior: float = 3.0
+        self, increments: int, components: int = 1, *, start: float = 0.5, memory: float = 8.0, prior: float = 1.0
     ) -> None:
         """`start`: weights before anything is learned, worth `prior` cycles. `memory`: in cycles."""
         if increments < 1 or components < 1 or not 0 <= start <= 1 or not memory >= 1 or not prior > 0:
