@@ -16,12 +16,13 @@ from .doppler import (
     vector_doppler,
 )
 from .echoes import EchoModel, simulate_packet
+from .estimates import Estimates, Flag
 from .flow import Flow, LinearFlow, RecordingFlow
 from .noise import NoiseModel, measure_noise
 from .plugin import LibraryTracker, Tracker
 from .pointspread import GaussianPointSpread, PointSpread, SampledPointSpread
 from .speckle import SpeckleOptions, measure_speckle
-from .tracking import Estimates, Flag, SpeckleTracker, track
+from .tracking import SpeckleTracker, track
 from .training import SwirlFlow, TrainingPlan, calibrate, random_swirl
 from .uff import UffVolumes, read_uff, write_uff
 

@@ -16,7 +16,7 @@ from geometry import Recording
 
 from .acquisition import Beams, Packet
 from .clutter import ClutterFilter, FIRFilter
-from .fields import convolve_axis
+from .fields import box_sum
 from .measurement import Canvas, ScannerOptions, scanned
 
 
@@ -69,7 +69,7 @@ def colour_doppler(packet: Packet, points: Tensor, options: ColourDoppler) -> Do
     sums = torch.stack([first.real, first.imag, power, finite.to(power)])
     for number, step in enumerate(packet.grid.spacing):
         nodes = 2 * round(options.window / (2 * step)) + 1
-        sums = convolve_axis(sums, sums.new_ones(nodes), -1 - number, padded=True)
+        sums = box_sum(sums, nodes, sums.dim() - 1 - number)
     real, imaginary, power, count = sums[(slice(None), *place.unbind(1))]
     coherence = (torch.hypot(real, imaginary) / power.clamp_min(torch.finfo(power.dtype).tiny)).clamp(0, 1)
     per_radian = packet.acquisition.prf / packet.acquisition.phase_per_metre

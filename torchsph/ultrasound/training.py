@@ -10,8 +10,9 @@ from torch import Tensor
 
 from geometry import Grid
 
-from .calibration import Calibration, fit_calibration, joined
+from .calibration import Calibration, fit_calibration
 from .echoes import EchoModel, simulate_packet
+from .estimates import Estimates
 from .tracking import SpeckleTracker
 
 
@@ -133,4 +134,4 @@ def calibrate(
         parts.append(estimates)
         errors.append(estimates.velocity - flow.velocity(points, 0.0).to(estimates.velocity))
     beam = model.beams.directions(torch.cat([points] * plan.simulations)).to(errors[0])
-    return fit_calibration(joined(parts), torch.cat(errors), beam)
+    return fit_calibration(Estimates.joined(parts), torch.cat(errors), beam)
