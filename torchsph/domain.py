@@ -63,6 +63,9 @@ class Domain:
         from .reservoirs import Reservoirs  # here, because reservoirs need the domain's wall fields
         from .sources import Sources
 
+        given = [valve.region for valve in self.scene.valves if valve.pressure is not None]
+        if given and isinstance(self.scheme.valve, PressureSource):
+            raise ValueError(f"valves at a given pressure (regions {given}) need Reservoir, not PressureSource")
         if self.scene.valves and isinstance(self.scheme.valve, PressureSource):
             self.sources = Sources(self.scene, self.scheme.valve, self.units, self.device, self.dtype)
         if self.scene.valves and isinstance(self.scheme.valve, Reservoir):
@@ -117,7 +120,7 @@ class Domain:
         if self.walls is not None:
             times.update(self.walls.moments.within(start, stop))
         if self.scheme.valve is not None:
-            times.update(t for valve in self.scene.valves for t in valve.events())
+            times.update(t for valve in self.scene.valves for t in valve.events(start, stop))
         tolerance = 1e-9 * max(1.0, abs(stop))
         inner = sorted(t for t in times if start + tolerance < t < stop - tolerance)
         return [*inner, stop] if stop > start else []

@@ -18,6 +18,7 @@ from .neighbours import PairSearch
 from .pairs import backend as choose_backend
 from .parameters import Coefficients, Parameters
 from .particles import Particles
+from .pressure_valves import PressureValves
 from .projection import Neighbourhood, ProjectionStepper, check_filled, divergence_free
 from .record import Record
 from .rollback import Checkpoints
@@ -68,6 +69,9 @@ class Simulation:
             self._stepper = Stepper(scheme, self._coefficients, search, scene.dimension, buffered=buffered)
         self._control = StepControl(self.record, scheme.step_floor)
         self._work = WorkAccount.of(self.domain, self.record)
+        self._pressures = PressureValves.of(self.domain, self._backend)
+        if self._pressures is not None:
+            self._stepper.held_kinds = self._pressures.kinds
         self._acceleration = torch.zeros_like(particles.position)
         self._imposed_at = self.time
         self._order: Tensor | None = None  # of the particles in space when they were last sorted
@@ -154,6 +158,8 @@ class Simulation:
             )
             self.domain.at(self.time + done * self.units.time)
             self._pass_valves()
+            if self._pressures is not None:
+                self.particles = self._pressures.driven(self.particles, self._stepper)
             self._sort_when_due()
             done = self._take_step(step, done, checkpoints)
 
