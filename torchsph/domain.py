@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
 
@@ -61,6 +63,9 @@ class Domain:
         from .reservoirs import Reservoirs  # here, because reservoirs need the domain's wall fields
         from .sources import Sources
 
+        given = [valve.region for valve in self.scene.valves if valve.pressure is not None]
+        if given and isinstance(self.scheme.valve, PressureSource):
+            raise ValueError(f"valves at a given pressure (regions {given}) need Reservoir, not PressureSource")
         if self.scene.valves and isinstance(self.scheme.valve, PressureSource):
             self.sources = Sources(self.scene, self.scheme.valve, self.units, self.device, self.dtype)
         if self.scene.valves and isinstance(self.scheme.valve, Reservoir):
@@ -115,7 +120,7 @@ class Domain:
         if self.walls is not None:
             times.update(self.walls.moments.within(start, stop))
         if self.scheme.valve is not None:
-            times.update(t for valve in self.scene.valves for t in valve.events())
+            times.update(t for valve in self.scene.valves for t in valve.events(start, stop))
         tolerance = 1e-9 * max(1.0, abs(stop))
         inner = sorted(t for t in times if start + tolerance < t < stop - tolerance)
         return [*inner, stop] if stop > start else []
@@ -180,10 +185,12 @@ class Domain:
     def body_force(self, particles: Particles) -> Tensor | None:
         """Acceleration (N, D) by gravity and pressure sources, or None."""
         total = self._gravity(particles)
-        if self.sources is not None and self._open:
+        push = None
+        if self.sources is not None:
             push = self.sources.acceleration(particles, self._open, self.time_of(particles))
-            total = push if total is None else total + push
-        return total
+        if push is None or total is None:
+            return total if push is None else push
+        return total + push
 
     def _gravity(self, particles: Particles) -> Tensor | None:
         """Gravity at the particles' present times (N, D) or None."""
@@ -202,16 +209,25 @@ class Domain:
         """What an interval needs before its first step: buffers behind valves that have just opened."""
         return particles if self.reservoirs is None else self.reservoirs.opened(particles)
 
-    def finish(self, particles: Particles, record: Record, time: float) -> Particles:
+    def finish(
+        self, particles: Particles, record: Record, time: float, pressure: Callable[[Particles], Tensor]
+    ) -> Particles:
         """What an interval leaves behind: periodic positions wrapped, particles gone through a valve taken out."""
         particles = self._wrapped(particles)
-        return particles if self.sources is None else self.sources.without_gone(particles, self._open, time, record)
+        if self.sources is None:
+            return particles
+        return self.sources.without_gone(particles, self._open, time, record, pressure)
 
-    def exchange(self, particles: Particles, record: Record) -> tuple[Particles, bool]:
-        """Pass particles between fluid and buffers; True where the particles were renumbered."""
+    def exchange(
+        self, particles: Particles, record: Record, pressure: Callable[[Particles], Tensor]
+    ) -> tuple[Particles, bool]:
+        """Pass particles between fluid and buffers; True where the particles were renumbered.
+
+        ``pressure`` gives p / rho0 of particles, for the account of the energy that passes.
+        """
         if self.reservoirs is None or not self._open:
             return particles, False
-        return self.reservoirs.exchange(particles, record)
+        return self.reservoirs.exchange(particles, record, pressure)
 
     def constrain(
         self, before: Particles, after: Particles, wall: WallSample | None, step: Tensor, record: Record

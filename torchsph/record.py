@@ -22,6 +22,10 @@ class Record:
         crossed_wall: how often a particle was found beyond the wall and put back.
         inserted, removed: particles that entered and left, by valve: (members, valves).
         inflow, outflow: volume that entered and left, by valve, m^D (in a plane m^2): (members, valves).
+        energy_in, energy_out: kinetic energy and work of pressure that entered and left with it, by valve, J (in a
+            plane J/m): (members, valves).
+        wall_work: done on the fluid by moving walls: pressure, friction and stops; J (in a plane J/m).
+        source_work: done on the fluid by pressure sources, J (in a plane J/m).
         filling: volume of the particles inside over that of the cavity now; NaN in scenes without walls.
         limited_by: how many steps each limit decided, (members, limits); names in ``terms.LIMITS``.
         reductions: how often a limit asked for a step shorter than the step before by more than a hundredth.
@@ -50,6 +54,10 @@ class Record:
     removed: Tensor = field(init=False)
     inflow: Tensor = field(init=False)
     outflow: Tensor = field(init=False)
+    energy_in: Tensor = field(init=False)
+    energy_out: Tensor = field(init=False)
+    wall_work: Tensor = field(init=False)
+    source_work: Tensor = field(init=False)
     filling: Tensor = field(init=False)
     limited_by: Tensor = field(init=False)
     reductions: Tensor = field(init=False)
@@ -70,9 +78,13 @@ class Record:
         self.failed = torch.zeros(self.members, dtype=torch.bool, device=self.device)
         one = torch.ones(self.members, dtype=torch.float64, device=self.device)
         self.smallest_density, self.largest_density = one.clone(), one.clone()
-        self.inflow, self.outflow = (one[:, None].repeat(1, self.valves) * 0.0 for _ in range(2))
+        self.inflow, self.outflow, self.energy_in, self.energy_out = (
+            one[:, None].repeat(1, self.valves) * 0.0 for _ in range(4)
+        )
         self.filling = one * float("nan")
-        self.largest_mach, self.largest_mismatch = torch.zeros_like(one), torch.zeros_like(one)
+        self.largest_mach, self.largest_mismatch, self.wall_work, self.source_work = (
+            torch.zeros_like(one) for _ in range(4)
+        )
 
     def note_density(self, smallest: Tensor, largest: Tensor) -> None:
         """Widen the density range by deviations (members,) from the rest density."""
@@ -96,6 +108,8 @@ class Record:
             "largest_mach": self.largest_mach.tolist(), "outside": self.outside.tolist(),
             "crossed_wall": self.crossed_wall.tolist(), "inserted": self.inserted.tolist(),
             "removed": self.removed.tolist(), "inflow": self.inflow.tolist(), "outflow": self.outflow.tolist(),
+            "energy_in": self.energy_in.tolist(), "energy_out": self.energy_out.tolist(),
+            "wall_work": self.wall_work.tolist(), "source_work": self.source_work.tolist(),
             "filling": self.filling.tolist(), "limited_by": steps, "searches": self.searches,
             "reductions": self.reductions.tolist(), "floored": self.floored.tolist(),
             "rollbacks": self.rollbacks.tolist(), "overflows": self.overflows,
