@@ -11,6 +11,7 @@ from .incompressible import Projection
 from .observation_error import ObservationError, estimate_error
 from .particle_filter import FilteredRun, filter_sph
 from .pipeline import DEFAULT_METHOD, METHODS, MethodResult, forecast_skill, make_model, run_methods
+from .population import PopulationControl
 from .presets import PRESETS, preset
 from .scene import Fluid, Scene, Valve
 from .schemes import (
@@ -32,8 +33,8 @@ from .smoothing import KERNELS, SmoothingKernel, kernel
 __all__ = [
     "DEFAULT_METHOD", "KERNELS", "METHODS", "PRESETS", "XSPH", "CompleteKernelWall", "EnsembleOptions",
     "EnsembleRun", "FilteredRun", "Fluid", "ForecastSkill", "GammaRamp", "GridForecast", "MethodResult",
-    "NumericalFailure", "ObservationError", "PotentialWall", "PressureSource", "Projection", "Reservoir",
-    "Rollback", "Scene", "Seeding", "Simulation", "Simulator", "SmoothingKernel", "Transfer", "Valve",
+    "NumericalFailure", "ObservationError", "PopulationControl", "PotentialWall", "PressureSource", "Projection",
+    "Reservoir", "Rollback", "Scene", "Seeding", "Simulation", "Simulator", "SmoothingKernel", "Transfer", "Valve",
     "WeaklyCompressible", "__version__", "assimilate", "default_filter", "estimate_error", "filter_sph",
     "forecast_skill", "kernel", "make_model", "preset", "run_methods", "skill", "smooth",
 ]  # fmt: skip

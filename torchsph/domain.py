@@ -173,14 +173,14 @@ class Domain:
             share = (self._times - early) / (late - early)
             fraction = share.clamp(0.0, 1.0).to(self.dtype)
             fraction = per_particle(fraction, particles.member) if fraction.ndim else fraction
-        return self.walls.sample(self._fields, fraction, self._wrapped_points(particles.position))
+        return self.walls.sample(self._fields, fraction, self.wrapped(particles.position))
 
     def sample_at(self, position: Tensor) -> WallSample:
         """Walls at points (n, D), internal, at the present time (one for all members)."""
         early, late = self._bracket
         share = float((self._times.max() - early) / (late - early)) if late > early else 0.0
         fraction = torch.full((), min(max(share, 0.0), 1.0), dtype=self.dtype, device=self.device)
-        return self.walls.sample(self._fields, fraction, self._wrapped_points(position))
+        return self.walls.sample(self._fields, fraction, self.wrapped(position))
 
     def body_force(self, particles: Particles) -> Tensor | None:
         """Acceleration (N, D) by gravity and pressure sources, or None."""
@@ -260,16 +260,35 @@ class Domain:
 
     def _wrapped(self, particles: Particles) -> Particles:
         return particles if self.period is None else particles.changed(
-            position=self._wrapped_points(particles.position)
+            position=self.wrapped(particles.position)
         )
 
-    def _wrapped_points(self, position: Tensor) -> Tensor:
+    def wrapped(self, position: Tensor) -> Tensor:
         """Points (n, D), internal, brought back into the periodic box."""
         if self.period is None:
             return position
         finite = torch.isfinite(self.period)
         length = torch.where(finite, self.period, torch.ones_like(self.period))
         return torch.where(finite, torch.remainder(position, length), position)
+
+    def shortest(self, way: Tensor) -> Tensor:
+        """Differences (n, D) of positions, internal, the shortest way around the periodic box."""
+        if self.period is None:
+            return way
+        finite = torch.isfinite(self.period)
+        length = torch.where(finite, self.period, torch.ones_like(self.period))
+        return torch.where(finite, way - length * torch.round(way / length), way)
+
+    def beyond_valves(self, position: Tensor) -> Tensor:
+        """(n,) bool: points (n, D), internal, at an open valve or behind it, where the walls' distance knows no end."""
+        beyond = torch.zeros_like(position[:, 0], dtype=torch.bool)
+        if self.reservoirs is not None:
+            for _, frame in self.reservoirs.active():
+                beyond |= frame.behind(position)
+        if self.sources is not None:
+            for region in self._open:
+                beyond |= self.sources.behind(position, region, self.middle)
+        return beyond
 
     def account(self, particles: Particles, record: Record, time: float) -> None:
         """Count the particles that are beyond the walls now."""

@@ -21,6 +21,7 @@ class Record:
         outside: particles beyond the wall now, in no open valve.
         crossed_wall: how often a particle was found beyond the wall and put back.
         inserted, removed: particles that entered and left, by valve: (members, valves).
+        merged, reseeded: particles that population control merged into others, and that it put into holes.
         inflow, outflow: volume that entered and left, by valve, m^D (in a plane m^2): (members, valves).
         energy_in, energy_out: kinetic energy and work of pressure that entered and left with it, by valve, J (in a
             plane J/m): (members, valves).
@@ -52,6 +53,8 @@ class Record:
     crossed_wall: Tensor = field(init=False)
     inserted: Tensor = field(init=False)
     removed: Tensor = field(init=False)
+    merged: Tensor = field(init=False)
+    reseeded: Tensor = field(init=False)
     inflow: Tensor = field(init=False)
     outflow: Tensor = field(init=False)
     energy_in: Tensor = field(init=False)
@@ -74,6 +77,7 @@ class Record:
         self.steps, self.outside, self.crossed_wall = counts(), counts(), counts()
         self.reductions, self.floored, self.rollbacks = counts(), counts(), counts()
         self.pressure_iterations, self.unconverged = counts(), counts()
+        self.merged, self.reseeded = counts(), counts()
         self.inserted, self.removed, self.limited_by = counts(self.valves), counts(self.valves), counts(len(LIMITS))
         self.failed = torch.zeros(self.members, dtype=torch.bool, device=self.device)
         one = torch.ones(self.members, dtype=torch.float64, device=self.device)
@@ -108,6 +112,7 @@ class Record:
             "largest_mach": self.largest_mach.tolist(), "outside": self.outside.tolist(),
             "crossed_wall": self.crossed_wall.tolist(), "inserted": self.inserted.tolist(),
             "removed": self.removed.tolist(), "inflow": self.inflow.tolist(), "outflow": self.outflow.tolist(),
+            "merged": self.merged.tolist(), "reseeded": self.reseeded.tolist(),
             "energy_in": self.energy_in.tolist(), "energy_out": self.energy_out.tolist(),
             "wall_work": self.wall_work.tolist(), "source_work": self.source_work.tolist(),
             "filling": self.filling.tolist(), "limited_by": steps, "searches": self.searches,

@@ -313,6 +313,12 @@ class Frame:
         """In-plane distance from the rim, (n,), positive over the opening."""
         return self._plane.lateral_distance(position)
 
+    def behind(self, position: Tensor) -> Tensor:
+        """(n,) bool: points (n, D) less than half a spacing before the opening, or in the channel behind it."""
+        height = self.height(position)
+        aside = (position - self.centre - height[:, None] * self.normal).norm(dim=1)
+        return (height > -0.5) & (aside < self.radius + 1.0)
+
     def lattice(self, length: float) -> Tensor:
         """Unit lattice in the channel of the given length behind the opening, (n, D)."""
         reach = int(np.ceil(self.radius)) + 1
