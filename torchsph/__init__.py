@@ -24,7 +24,7 @@ from .schemes import (
     Rollback,
     WeaklyCompressible,
 )
-from .seeding import Seeding
+from .seeding import ResidualMotion, Seeding, residual_motion
 from .simulation import NumericalFailure, Simulation
 from .simulator import Simulator
 from .smooth import smooth
@@ -34,7 +34,8 @@ __all__ = [
     "DEFAULT_METHOD", "KERNELS", "METHODS", "PRESETS", "XSPH", "CompleteKernelWall", "EnsembleOptions",
     "EnsembleRun", "FilteredRun", "Fluid", "ForecastSkill", "GammaRamp", "GridForecast", "MethodResult",
     "NumericalFailure", "ObservationError", "PopulationControl", "PotentialWall", "PressureSource", "Projection",
-    "Reservoir", "Rollback", "Scene", "Seeding", "Simulation", "Simulator", "SmoothingKernel", "Transfer", "Valve",
-    "WeaklyCompressible", "__version__", "assimilate", "default_filter", "estimate_error", "filter_sph",
-    "forecast_skill", "kernel", "make_model", "preset", "run_methods", "skill", "smooth",
+    "Reservoir", "ResidualMotion", "Rollback", "Scene", "Seeding", "Simulation", "Simulator", "SmoothingKernel",
+    "Transfer", "Valve", "WeaklyCompressible", "__version__", "assimilate", "default_filter", "estimate_error",
+    "filter_sph", "forecast_skill", "kernel", "make_model", "preset", "residual_motion", "run_methods", "skill",
+    "smooth",
 ]  # fmt: skip

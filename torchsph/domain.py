@@ -21,6 +21,7 @@ from .transfer import fill_beyond
 from .units import Units
 from .wallfield import WallFields
 from .walls import WallSample
+from .work import energy_unit
 
 # a particle this far beyond a wall (spacings) counts as outside; the soft potential is meant to be entered a little
 _OUTSIDE = 0.5
@@ -38,6 +39,7 @@ class Domain:
         self.scene, self.scheme, self.units = scene, scheme, units
         self.device, self.dtype = device, dtype
         smoothing = kernel(scheme.kernel)
+        self._energy = energy_unit(units, scene.fluid.density, scene.dimension)
         self.support_radius = smoothing.support * scheme.smoothing_ratio
         self.period = self._period()
         self._steady_gravity = None
@@ -253,6 +255,8 @@ class Domain:
         record.crossed_wall.index_add_(0, after.member[near], (distance < 0).to(torch.int64))
         velocity = after.velocity[near]
         towards = ((velocity - wall.velocity[near]) * normal).sum(1).clamp_max(0.0)
+        done = -(after.mass[near] * towards * (normal * wall.velocity[near]).sum(1)).double() * self._energy
+        record.wall_work.index_add_(0, after.member[near], done.nan_to_num(0.0, 0.0, 0.0))
         return after.changed(
             position=after.position.index_add(0, near, (gap - distance)[:, None] * normal),
             velocity=after.velocity.index_add(0, near, -towards[:, None] * normal),

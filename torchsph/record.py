@@ -27,7 +27,9 @@ class Record:
             plane J/m): (members, valves).
         wall_work: done on the fluid by moving walls: pressure, friction and stops; J (in a plane J/m).
         source_work: done on the fluid by pressure sources, J (in a plane J/m).
-        filling: volume of the particles inside over that of the cavity now; NaN in scenes without walls.
+        filling: volume of the particles inside over that of the cavity now; NaN in scenes without walls. Where a closed
+            cavity changes its volume, it goes along: a weakly compressible fluid is compressed or thinned, and the
+            incompressible scheme reports the mismatch below.
         limited_by: how many steps each limit decided, (members, limits); names in ``terms.LIMITS``.
         reductions: how often a limit asked for a step shorter than the step before by more than a hundredth.
         floored: steps that the scheme's floor kept longer than the limits asked for; such a run may be unstable.
@@ -100,7 +102,7 @@ class Record:
         return {
             "steps": int(self.steps.sum()), "failed": int(self.failed.sum()), "outside": int(self.outside.sum()),
             "crossed_wall": int(self.crossed_wall.sum()), "inserted": int(self.inserted.sum()),
-            "removed": int(self.removed.sum()),
+            "removed": int(self.removed.sum()), "merged": int(self.merged.sum()), "reseeded": int(self.reseeded.sum()),
         }
 
     def summary(self) -> dict[str, object]:

@@ -235,7 +235,7 @@ class Simulation:
         self.record.note_density(lowest, highest)
         broken = self._broken(lowest, highest) & ~self.record.failed
         if self._work is not None:
-            self._work.note(before, stepped, after, wall, inner, self._stepper, (step > 0) & ~broken)
+            self._work.note(before, stepped, wall, inner, self._stepper, (step > 0) & ~broken)
         if bool(broken.any()):
             done = self._recover(broken, before, push, done, checkpoints)
         return done
