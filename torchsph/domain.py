@@ -294,14 +294,16 @@ class Domain:
                 beyond |= self.sources.behind(position, region, self.middle)
         return beyond
 
-    def account(self, particles: Particles, record: Record, time: float) -> None:
-        """Count the particles that are beyond the walls now."""
+    def account(self, particles: Particles, record: Record, time: float, since: float) -> None:
+        """Count the particles beyond the walls now, at ``time`` (s), and the volumes; the run began at ``since``."""
         self.at(time)
         wall = self.sample(particles)
         if wall is not None:
             beyond = (wall.distance < -_OUTSIDE) & particles.fluid
             record.outside = particles.per_member(beyond.to(torch.int64), "sum")
             record.filling = self.filling(particles, time)
+            if self.scene.walls.moves:
+                record.cavity_change.fill_(self.fluid_volume(time) - self.fluid_volume(since))
 
     def imposed(self, particles: Particles, grid: Grid, velocity: Tensor, mask: Tensor, time: float) -> Particles:
         """Particles with the velocity of a grid field, continued beyond its mask by the walls' velocity."""
