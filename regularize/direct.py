@@ -52,6 +52,14 @@ class PreparedSystem:
             other._packed.system = system
         return other
 
+    def with_weights(self, system: System) -> "PreparedSystem":
+        """The same points in the same order with the weights and right-hand sides of ``system``."""
+        other = copy(self)
+        other.system = system
+        if self._packed is not None:
+            other._packed = self._packed.with_weights(system)
+        return other
+
     def band(self) -> torch.Tensor:
         """Lower band (unknowns, width) of the normal matrix, float64."""
         if self._packed is not None:
