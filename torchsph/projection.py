@@ -77,30 +77,42 @@ class Neighbourhood:
         return torch.where(counted, excess, torch.zeros_like(excess))
 
     def push(
-        self, source: Tensor, start: Tensor | None, surface: Tensor | None, tolerance: float, iterations: int
+        self, source: Tensor, start: Tensor | None, surface: Tensor | None, tolerance: float, iterations: int,
+        held: Tensor | None = None,
     ) -> tuple[Tensor, PoissonSolution]:
         """Solve -laplacian(u) = ``source`` (N,); minus the gradient of u (N, D), 0 in reservoirs, and the solution.
 
-        Walls and buffers are impermeable to u (Neumann); where ``surface`` (N,) bool u is 0.
+        The solution is continued into reservoirs. Walls and buffers are impermeable to u (Neumann); where ``surface``
+        (N,) bool u is 0, where ``held`` (N,) bool, in buffers, it is as in ``start``.
         """
         p, backend = self.particles, self.search.backend
         state, fluid = p.state(p.deviation), p.fluid
-        diagonal = backend.laplacian(self.pairs, state, self.support, torch.zeros_like(source), fluid)[1]
+        coupled = fluid if held is None else fluid | held
+        diagonal = backend.laplacian(self.pairs, state, self.support, torch.zeros_like(source), coupled)[1]
         free, singular = fluid, torch.ones(p.members, dtype=torch.bool, device=fluid.device)
         if surface is not None:
             free = fluid & ~surface
             singular = p.per_member(surface.to(torch.int64), "sum") == 0
+        if held is not None:
+            singular = singular & (p.per_member(held.to(torch.int64), "sum") == 0)
         problem = PoissonProblem(
-            lambda u: backend.laplacian(self.pairs, state, self.support, u, fluid)[0], diagonal, p.mass, free, singular,
-            p.member, p.members,
+            lambda u: backend.laplacian(self.pairs, state, self.support, u, coupled)[0], diagonal, p.mass, free,
+            singular, p.member, p.members,
         )
-        found = solve(problem, source * self.share, start, tolerance=tolerance, iterations=iterations)
+        source = source * self.share
+        if held is not None:
+            kept = torch.where(held, start, torch.zeros_like(start))
+            source = source - problem.apply(kept)
+        found = solve(problem, source, start, tolerance=tolerance, iterations=iterations)
+        if held is not None:
+            found = replace(found, values=found.values + kept)
         if self.wall is not None:
             part = problem.total(torch.where(fluid, p.mass * self.share, torch.zeros_like(source)))
             whole = problem.total(torch.where(fluid, p.mass, torch.zeros_like(source)))
             found = replace(found, mismatch=found.mismatch * whole / part.clamp_min(_TINY))
         terms = MomentumTerms(pressure="difference")
-        slope = backend.momentum(self.pairs, p.state(self._continued(found.values)), self.support, terms)
+        found = replace(found, values=self._continued(found.values, held))
+        slope = backend.momentum(self.pairs, p.state(found.values), self.support, terms)
         slope = slope / self.share[:, None] if self.wall is not None else slope
         slope = torch.where(fluid[:, None], slope, torch.zeros_like(slope))
         return (slope if self.wall is not None else self._without_thrust(slope)), found
@@ -115,9 +127,9 @@ class Neighbourhood:
         thrust = push.new_zeros((p.members, push.shape[1])).index_add(0, p.member, p.mass[:, None] * push)
         return push - (thrust / mass[:, None]).index_select(0, p.member)
 
-    def _continued(self, values: Tensor) -> Tensor:
-        """Values of the fluid, and in buffers the mean of the fluid around: (N,)."""
-        fluid = self.particles.fluid
+    def _continued(self, values: Tensor, held: Tensor | None) -> Tensor:
+        """Values of the fluid and where ``held``, and in other buffers the mean of the fluid around: (N,)."""
+        fluid = self.particles.fluid if held is None else self.particles.fluid | held
         if bool(fluid.all()):
             return values
         part = torch.where(fluid, self.particles.mass, torch.zeros_like(values))
@@ -180,6 +192,7 @@ class ProjectionStepper:
         self, scheme: Projection, coefficients: Coefficients, search: PairSearch, dimension: int, record: Record
     ) -> None:
         self.scheme, self.pair_search, self.dimension, self._record = scheme, search, dimension, record
+        self.held_kinds: Tensor | None = None  # kinds of the buffers whose pressure is given
         self.use(coefficients)
 
     def use(self, coefficients: Coefficients) -> None:
@@ -194,6 +207,16 @@ class ProjectionStepper:
             concentration=coefficients.shifting is not None,
             shepard=self.scheme.relaxation is not None or self.scheme.surface is not None,
         )
+
+    @staticmethod
+    def at_pressure(particles: Particles, row: Tensor, pressure: Tensor) -> Particles:
+        """Particles whose ``row`` (n,) carry ``pressure`` (n,), p / rho0, into the next projection."""
+        return particles.changed(pressure=ProjectionStepper.pressure(particles).index_copy(0, row, pressure))
+
+    @staticmethod
+    def pressure(particles: Particles) -> Tensor:
+        """p / rho0 (N,) of the last projection; 0 before the first."""
+        return torch.zeros_like(particles.mass) if particles.pressure is None else particles.pressure
 
     def step(
         self, particles: Particles, step: Tensor, number: Tensor, around: Surroundings
@@ -220,8 +243,9 @@ class ProjectionStepper:
         if self.scheme.relaxation is not None:
             counted = particles.inside if surface is None else particles.inside & ~surface
             source = source + here.excess(filling, counted) / self.scheme.relaxation
+        held = None if self.held_kinds is None else torch.isin(particles.kind, self.held_kinds)
         push, found = here.push(
-            source, self._guess(particles, dt), surface, self.scheme.tolerance, self.scheme.iterations
+            source, self._guess(particles, dt), surface, self.scheme.tolerance, self.scheme.iterations, held
         )
         self._account(found, step)
         velocity = particles.velocity + push
