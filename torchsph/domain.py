@@ -194,6 +194,10 @@ class Domain:
             return total if push is None else push
         return total + push
 
+    def shortfall(self, particles: Particles) -> Tensor:
+        """By how much (N,), per time, the volume of a member's particles should grow to fill the cavity."""
+        return per_particle(self.reservoirs.shortfall(particles), particles.member)
+
     def _gravity(self, particles: Particles) -> Tensor | None:
         """Gravity at the particles' present times (N, D) or None."""
         if self._steady_gravity is not None:

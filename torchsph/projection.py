@@ -243,7 +243,13 @@ class ProjectionStepper:
         if self.scheme.relaxation is not None:
             counted = particles.inside if surface is None else particles.inside & ~surface
             source = source + here.excess(filling, counted) / self.scheme.relaxation
-        held = None if self.held_kinds is None else torch.isin(particles.kind, self.held_kinds)
+        held = None
+        if self.held_kinds is not None:
+            held = torch.isin(particles.kind, self.held_kinds)
+            # through other openings the flux sees to it; here the flow has to draw in what is missing
+            drawn = particles.per_member(held.to(torch.int64), "sum") > 0
+            drawn = particles.inside & drawn.index_select(0, particles.member)
+            source = source - torch.where(drawn, around.shortfall(particles), torch.zeros_like(source))
         push, found = here.push(
             source, self._guess(particles, dt), surface, self.scheme.tolerance, self.scheme.iterations, held
         )

@@ -95,6 +95,13 @@ class Reservoirs:
         filled = particles.per_member((part * particles.mass).double(), "sum")
         return (self._looked_up(self.volume, times, torch.float64) - filled).to(self.domain.dtype)
 
+    def shortfall(self, particles: Particles) -> Tensor:
+        """Share of the cavity's volume, per time, that should come in for what particles lack, (members,)."""
+        times = self.domain.member_times(particles.members)
+        if self.relaxation is None:
+            return torch.zeros_like(times, dtype=self.domain.dtype)
+        return self._deficit(particles, times) / (self._looked_up(self.volume, times) * self.relaxation)
+
     def frame(self, number: int) -> Frame:
         """Opening ``number`` in the middle of the present interval (openings move little within one)."""
         time = self.domain.middle
