@@ -30,6 +30,9 @@ class Surroundings(Protocol):
     def body_force(self, particles: Particles) -> Tensor | None:
         """Acceleration (N, D) by gravity and pressure sources, or None."""
 
+    def later(self, particles: Particles, step: Tensor) -> Particles:
+        """Go on in time by ``step`` (members,); the particles with what reservoirs prescribe then."""
+
 
 @dataclass(frozen=True)
 class RateSums:
