@@ -77,28 +77,38 @@ class Neighbourhood:
         return torch.where(counted, excess, torch.zeros_like(excess))
 
     def push(
-        self, source: Tensor, start: Tensor | None, surface: Tensor | None, tolerance: float, iterations: int
+        self, source: Tensor, start: Tensor | None, surface: Tensor | None, tolerance: float, iterations: int,
+        held: Tensor | None = None,
     ) -> tuple[Tensor, PoissonSolution]:
         """Solve -laplacian(u) = ``source`` (N,); minus the gradient of u (N, D), 0 in reservoirs, and the solution.
 
-        Walls and buffers are impermeable to u (Neumann); where ``surface`` (N,) bool u is 0.
+        Walls and buffers are impermeable to u (Neumann); where ``surface`` (N,) bool u is 0, where ``held`` (N,) bool,
+        in buffers, it is as in ``start``.
         """
         p, backend = self.particles, self.search.backend
         state, fluid = p.state(p.deviation), p.fluid
+        coupled = fluid if held is None else fluid | held
         free, singular = fluid, torch.ones(p.members, dtype=torch.bool, device=fluid.device)
         if surface is not None:
             free = fluid & ~surface
             singular = p.per_member(surface.to(torch.int64), "sum") == 0
+        source = source * self.share
+        if held is not None:
+            singular = singular & (p.per_member(held.to(torch.int64), "sum") == 0)
+            kept = torch.where(held, start, torch.zeros_like(start))
+            source = source - backend.laplacian(self.pairs, state, self.support, kept, coupled)[0]
         found = backend.poisson(
-            self.pairs, state, self.support, source * self.share, start, free=free, active=fluid, singular=singular,
+            self.pairs, state, self.support, source, start, free=free, active=coupled, singular=singular,
             tolerance=tolerance, iterations=iterations,
         )
+        if held is not None:
+            found = replace(found, values=found.values + kept)
         if self.wall is not None:
             volume = torch.where(fluid, p.mass, torch.zeros_like(p.mass)).double()
             part = p.per_member(volume * self.share, "sum").clamp_min(_TINY)
             found = replace(found, mismatch=found.mismatch * p.per_member(volume, "sum") / part)
         # buffers take no part: the gradient by differences then continues the fluid's own pressure into them
-        mass = p.mass if bool(fluid.all()) else torch.where(fluid, p.mass, torch.zeros_like(p.mass))
+        mass = p.mass if bool(coupled.all()) else torch.where(coupled, p.mass, torch.zeros_like(p.mass))
         state = p.changed(mass=mass).state(found.values)
         slope = backend.momentum(self.pairs, state, self.support, MomentumTerms(pressure="difference"))
         slope = slope / self.share[:, None] if self.wall is not None else slope
@@ -164,6 +174,7 @@ class ProjectionStepper:
         self, scheme: Projection, coefficients: Coefficients, search: PairSearch, dimension: int, record: Record
     ) -> None:
         self.scheme, self.pair_search, self.dimension, self._record = scheme, search, dimension, record
+        self.held_kinds: Tensor | None = None  # kinds of the buffers whose pressure is given
         self.use(coefficients)
 
     def use(self, coefficients: Coefficients) -> None:
@@ -178,6 +189,16 @@ class ProjectionStepper:
             concentration=coefficients.shifting is not None,
             shepard=self.scheme.relaxation is not None or self.scheme.surface is not None,
         )
+
+    @staticmethod
+    def at_pressure(particles: Particles, row: Tensor, pressure: Tensor) -> Particles:
+        """Particles whose ``row`` (n,) carry ``pressure`` (n,), p / rho0, into the next projection."""
+        return particles.changed(pressure=ProjectionStepper.pressure(particles).index_copy(0, row, pressure))
+
+    @staticmethod
+    def pressure(particles: Particles) -> Tensor:
+        """p / rho0 (N,) of the last projection; 0 before the first."""
+        return torch.zeros_like(particles.mass) if particles.pressure is None else particles.pressure
 
     def step(
         self, particles: Particles, step: Tensor, number: Tensor, around: Surroundings
@@ -204,8 +225,9 @@ class ProjectionStepper:
         # the divergence of friction itself, small in a fluid of little viscosity, is met in the next step
         divergence, crowding = completed(sums.divergence, sums.concentration, middle.velocity, wall)
         source, surface = self._source(here, sums, divergence)
+        held = None if self.held_kinds is None else torch.isin(middle.kind, self.held_kinds)
         push, found = here.push(
-            source, self._guess(middle, weight, dt), surface, self.scheme.tolerance, self.scheme.iterations
+            source, self._guess(middle, weight, dt), surface, self.scheme.tolerance, self.scheme.iterations, held
         )
         self._account(found, step)
         velocity = middle.velocity + push
@@ -235,11 +257,12 @@ class ProjectionStepper:
     def _weight(self, particles: Particles, around: Surroundings) -> Tensor | None:
         """The part (N, D) of a body force that only adds its potential to the pressure, or None.
 
-        Without a free surface a uniform force moves nothing along an axis that is not periodic. The pressure that
-        bears it would be large, and its differences on disordered particles stir the fluid; so it is left out of the
-        equation and added afterwards, exactly.
+        Without a free surface or a given pressure a uniform force moves nothing along an axis that is not periodic. The
+        pressure that bears it would be large, and its differences on disordered particles stir the fluid; so it is left
+        out of the equation and added afterwards, exactly.
         """
-        force = None if self.scheme.surface is not None else around.body_force(particles)
+        bound = self.scheme.surface is not None or self.held_kinds is not None
+        force = None if bound else around.body_force(particles)
         if force is None or self.pair_search.period is None:
             return force
         return torch.where(torch.isinf(self.pair_search.period), force, torch.zeros_like(force))
