@@ -157,6 +157,11 @@ class Domain:
         """Set the present time of the members, s: (members,) float64 or one for all."""
         self._times = torch.as_tensor(times, dtype=torch.float64, device=self.device)
 
+    def later(self, particles: Particles, step: Tensor) -> Particles:
+        """Go on by ``step`` (members,), internal; the particles with what buffers do at that time."""
+        self.at(self.member_times(particles.members) + step.double() * self.units.time)
+        return self.reservoirs.driven(particles) if self.reservoirs is not None and self._open else particles
+
     def time_of(self, particles: Particles) -> Tensor:
         """Present time of each particle's member, s, (N,) float64."""
         return self.member_times(particles.members).index_select(0, particles.member)

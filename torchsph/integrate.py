@@ -40,6 +40,9 @@ class Surroundings(Protocol):
     def shortfall(self, particles: Particles) -> Tensor:
         """By how much (N,), per time, the volume of a member's particles should grow to fill the cavity."""
 
+    def later(self, particles: Particles, step: Tensor) -> Particles:
+        """Go on in time by ``step`` (members,); the particles with what reservoirs prescribe then."""
+
 
 @dataclass(frozen=True)
 class RateSums:

@@ -181,6 +181,16 @@ class Reservoirs:
         total = particles.per_member(weight * particles.deviation, "sum")
         return (total / particles.per_member(weight, "sum").clamp_min(1.0))[members]
 
+    @staticmethod
+    def _mouth_pressure(
+        particles: Particles, frame: Frame, pressure: Callable[[Particles], Tensor]
+    ) -> Callable[[Particles], Tensor]:
+        """Mean pressure of the fluid near an orifice, which buffers of the incompressible scheme have none of."""
+        near = particles.select(((particles.position - frame.centre).norm(dim=1) < frame.radius) & particles.fluid)
+        total = near.per_member(pressure(near), "sum")
+        mean = total / near.per_member(torch.ones_like(near.mass), "sum").clamp_min(1.0)
+        return lambda some: mean.index_select(0, some.member)
+
     def driven(self, particles: Particles, *, channel: bool = False) -> Particles:
         """Give the buffers' particles their velocity for the present time; with ``channel`` also the free channels'."""
         times = self.domain.member_times(particles.members)
@@ -254,10 +264,12 @@ class Reservoirs:
             ):
                 if not bool(which.any()):
                     continue
-                some = particles.select(which)
+                some, level = particles.select(which), pressure
+                if which is entered and particles.pressure is not None and number not in self.given:
+                    level = self._mouth_pressure(particles, frame, pressure)
                 counter[:, valve] += some.per_member(torch.ones_like(some.member), "sum")
                 volume[:, valve] += some.per_member(some.mass.double(), "sum") * unit
-                energy[:, valve] += some.per_member(carried_energy(some, pressure(some)), "sum") * self._energy
+                energy[:, valve] += some.per_member(carried_energy(some, level(some)), "sum") * self._energy
         particles = particles.changed(kind=kind)
         if not fresh and not bool(gone.any()):
             return particles, False
