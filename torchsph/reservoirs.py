@@ -55,7 +55,9 @@ class Reservoirs:
         # a region may consist of several openings; each has a buffer of its own
         self.openings = [one for one in orifices(self.motion) if one.label in labels]
         self.valve_of = [labels[one.label] for one in self.openings]
-        self._frames: dict[tuple[int, int], _Frame] = {}
+        # openings whose flow follows from a given pressure instead (``pressure_valves``)
+        self.given = [n for n, valve in enumerate(self.valve_of) if self.valves[valve].pressure is not None]
+        self._frames: dict[tuple[int, int], Frame] = {}
 
     def _tables(self) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
         """Times (s), dV/dt and V of the cavity, internal; V is None where the particles' volume is not held to it."""
@@ -84,7 +86,7 @@ class Reservoirs:
         the sum does not jump as it crosses.
         """
         part = particles.inside.to(particles.mass.dtype)
-        for _, frame in self._active():
+        for _, frame in self.active():
             height = frame.height(particles.position)
             row = torch.nonzero(height.abs() < 0.5).squeeze(1)
             over = (frame.inset(particles.position[row]) + 0.5).clamp(0.0, 1.0)
@@ -93,7 +95,14 @@ class Reservoirs:
         filled = particles.per_member((part * particles.mass).double(), "sum")
         return (self._looked_up(self.volume, times, torch.float64) - filled).to(self.domain.dtype)
 
-    def frame(self, number: int) -> _Frame:
+    def shortfall(self, particles: Particles) -> Tensor:
+        """Share of the cavity's volume, per time, that should come in for what particles lack, (members,)."""
+        times = self.domain.member_times(particles.members)
+        if self.relaxation is None:
+            return torch.zeros_like(times, dtype=self.domain.dtype)
+        return self._deficit(particles, times) / (self._looked_up(self.volume, times) * self.relaxation)
+
+    def frame(self, number: int) -> Frame:
         """Opening ``number`` in the middle of the present interval (openings move little within one)."""
         time = self.domain.middle
         label = (number, int(round(time * 1e7)))
@@ -101,13 +110,13 @@ class Reservoirs:
             if len(self._frames) > _KEPT_FRAMES:
                 self._frames.clear()
             opening = self.openings[number]
-            self._frames[label] = _Frame(
+            self._frames[label] = Frame(
                 opening.at(time), opening.velocity(time) / self.units.speed, self.units.length, self.domain.dtype,
                 self.domain.device,
             )
         return self._frames[label]
 
-    def _active(self) -> list[tuple[int, _Frame]]:
+    def active(self) -> list[tuple[int, Frame]]:
         """(number, frame) of the openings of open valves."""
         chosen = self.domain.open_regions
         return [(n, self.frame(n)) for n, one in enumerate(self.openings) if one.label in chosen]
@@ -118,15 +127,16 @@ class Reservoirs:
         With several valves open at once the cavity fills through the first and empties through the last of them;
         openings of one region share by area.
         """
-        regions = sorted(self.domain.open_regions)
+        given = {self.openings[n].label for n in self.given}
+        regions = sorted(set(self.domain.open_regions) - given)
         mine = self.openings[number].label
         part = inflow.clamp_min(0.0) * (mine == regions[0]) + inflow.clamp_max(0.0) * (mine == regions[-1])
-        total = sum(frame.area for n, frame in self._active() if self.openings[n].label == mine)
+        total = sum(frame.area for n, frame in self.active() if self.openings[n].label == mine)
         return part * (self.frame(number).area / total)
 
     def _lead(self, number: int) -> float:
         """Length of the free channel before the buffer of an opening: 0 where fluid enters in the present interval."""
-        if not self.run_out:
+        if not self.run_out or number in self.given:
             return 0.0
         middle = torch.tensor([self.domain.middle], dtype=torch.float64, device=self.domain.device)
         return self.run_out if float(self._flux_through(number, self.inflow(middle))) < 0.0 else 0.0
@@ -139,14 +149,14 @@ class Reservoirs:
             kind = torch.tensor([k for n in gone for k in (RESERVOIR + n, CHANNEL - n)], device=particles.kind.device)
             stay = ~torch.isin(particles.kind, kind)
             particles = particles if bool(stay.all()) else particles.select(stay)
-        for number, frame in self._active():
+        for number, frame in self.active():
             has = particles.per_member((particles.kind == RESERVOIR + number).to(torch.int64), "sum") > 0
             empty = torch.nonzero(~has).squeeze(1)
             if empty.numel():
                 particles = particles.joined(self._buffer(particles, number, frame, empty))
         return particles
 
-    def _buffer(self, particles: Particles, number: int, frame: _Frame, members: Tensor) -> Particles:
+    def _buffer(self, particles: Particles, number: int, frame: Frame, members: Tensor) -> Particles:
         """A fresh lattice in the channel of one valve for some members, its first part free where fluid leaves."""
         lead = self._lead(number)
         place = frame.lattice(lead + self.length)
@@ -164,21 +174,35 @@ class Reservoirs:
         return new
 
     @staticmethod
-    def _mouth_deviation(particles: Particles, frame: _Frame, members: Tensor) -> Tensor:
+    def _mouth_deviation(particles: Particles, frame: Frame, members: Tensor) -> Tensor:
         """Mean density deviation of the fluid near an orifice, per member: what a new buffer starts with."""
         near = (particles.position - frame.centre).norm(dim=1) < frame.radius
         weight = (near & particles.fluid).to(particles.deviation.dtype)
         total = particles.per_member(weight * particles.deviation, "sum")
         return (total / particles.per_member(weight, "sum").clamp_min(1.0))[members]
 
+    @staticmethod
+    def _mouth_pressure(
+        particles: Particles, frame: Frame, pressure: Callable[[Particles], Tensor]
+    ) -> Callable[[Particles], Tensor]:
+        """Mean pressure of the fluid near an orifice, which buffers of the incompressible scheme have none of."""
+        near = particles.select(((particles.position - frame.centre).norm(dim=1) < frame.radius) & particles.fluid)
+        total = near.per_member(pressure(near), "sum")
+        mean = total / near.per_member(torch.ones_like(near.mass), "sum").clamp_min(1.0)
+        return lambda some: mean.index_select(0, some.member)
+
     def driven(self, particles: Particles, *, channel: bool = False) -> Particles:
         """Give the buffers' particles their velocity for the present time; with ``channel`` also the free channels'."""
         times = self.domain.member_times(particles.members)
         inflow = self.inflow(times)
-        if self.relaxation is not None and not channel:
+        active = self.active()
+        held = self.relaxation is not None and not any(number in self.given for number, _ in active)
+        if held and not channel:
             inflow = inflow + self._deficit(particles, times) / self.relaxation
         velocity = particles.velocity
-        for number, frame in self._active():
+        for number, frame in active:
+            if number in self.given:
+                continue
             mine, length = particles.kind == RESERVOIR + number, self.length
             if channel:
                 mine, length = mine | (particles.kind == CHANNEL - number), length + self._lead(number)
@@ -220,7 +244,7 @@ class Reservoirs:
     ) -> tuple[Particles, bool]:
         """Turn particles that have crossed an open orifice into the other kind; feed and clear the far ends."""
         kind, gone, fresh = particles.kind, torch.zeros_like(particles.fluid), []
-        for number, frame in self._active():
+        for number, frame in self.active():
             height, lead = frame.height(particles.position), self._lead(number)
             buffer, channel = RESERVOIR + number, CHANNEL - number
             entered = ((kind == buffer) | (kind == channel)) & (height < 0.0)
@@ -240,10 +264,12 @@ class Reservoirs:
             ):
                 if not bool(which.any()):
                     continue
-                some = particles.select(which)
+                some, level = particles.select(which), pressure
+                if which is entered and particles.pressure is not None and number not in self.given:
+                    level = self._mouth_pressure(particles, frame, pressure)
                 counter[:, valve] += some.per_member(torch.ones_like(some.member), "sum")
                 volume[:, valve] += some.per_member(some.mass.double(), "sum") * unit
-                energy[:, valve] += some.per_member(carried_energy(some, pressure(some)), "sum") * self._energy
+                energy[:, valve] += some.per_member(carried_energy(some, level(some)), "sum") * self._energy
         particles = particles.changed(kind=kind)
         if not fresh and not bool(gone.any()):
             return particles, False
@@ -252,13 +278,13 @@ class Reservoirs:
             particles = particles.joined(copy)
         return particles, True
 
-    def _left(self, kind: Tensor, height: Tensor, frame: _Frame, particles: Particles) -> Tensor:
+    def _left(self, kind: Tensor, height: Tensor, frame: Frame, particles: Particles) -> Tensor:
         """(N,) bool: particles of the fluid that have just left through an opening."""
         out = (kind == FLUID) & (height > _HYSTERESIS) & (height < self.run_out + self.length)
         return self._over(out, frame, particles)
 
     @staticmethod
-    def _over(candidates: Tensor, frame: _Frame, particles: Particles) -> Tensor:
+    def _over(candidates: Tensor, frame: Frame, particles: Particles) -> Tensor:
         """(N,) bool: those of the candidates (N,) bool that stand over the opening itself."""
         row = torch.nonzero(candidates).squeeze(1)
         if not row.numel():
@@ -272,7 +298,7 @@ class Reservoirs:
         A buffer so takes on the velocity profile that the field has at the orifice.
         """
         points = particles.position
-        for number, frame in self._active():
+        for number, frame in self.active():
             height = frame.height(points)
             inward = (-height - _MOUTH)[:, None] * frame.normal
             mine = (particles.kind == RESERVOIR + number) | (particles.kind == CHANNEL - number)
@@ -280,7 +306,7 @@ class Reservoirs:
         return points
 
 
-class _Frame:
+class Frame:
     """An opening in internal units on the device."""
 
     def __init__(
@@ -305,6 +331,12 @@ class _Frame:
     def inset(self, position: Tensor) -> Tensor:
         """In-plane distance from the rim, (n,), positive over the opening."""
         return self._plane.lateral_distance(position)
+
+    def behind(self, position: Tensor) -> Tensor:
+        """(n,) bool: points (n, D) less than half a spacing before the opening, or in the channel behind it."""
+        height = self.height(position)
+        aside = (position - self.centre - height[:, None] * self.normal).norm(dim=1)
+        return (height > -0.5) & (aside < self.radius + 1.0)
 
     def lattice(self, length: float) -> Tensor:
         """Unit lattice in the channel of the given length behind the opening, (n, D)."""
