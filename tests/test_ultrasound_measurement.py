@@ -40,7 +40,7 @@ def estimates(count, generator, variance):
     one = torch.ones(count)
     return Estimates(
         torch.zeros((count, 3)), 0.9 * one, 2 * one, torch.ones((count, 3)),
-        variance[:, None].expand(-1, 3), 0 * one, 20 * one,
+        variance[:, None].expand(-1, 3), 0 * one, 20 * one, 0 * one,
         torch.ones(count, dtype=torch.long), torch.zeros(count, dtype=torch.int32),
     )  # fmt: skip
 
@@ -156,7 +156,7 @@ def test_a_beam_of_another_dimension_is_refused():
 @pytest.mark.slow
 def test_deviations_hold_in_each_third_of_the_weight_on_held_out_simulations():
     """z-scores have deviations of 0.8 to 1.25 in every third of the weight."""
-    model, tracker, spacing = EchoModel(), SpeckleTracker(), (1e-3 / 6,) * 3
+    model, tracker, spacing = EchoModel(), SpeckleTracker(max_snr=30.0), (1e-3 / 6,) * 3
     calibration = calibrate(model, tracker, spacing, torch.Generator().manual_seed(0))
     plan = TrainingPlan()
     points = training_points(plan, (0.0,) * 3)
