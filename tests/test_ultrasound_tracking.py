@@ -1,5 +1,6 @@
 """Speckle tracking: correlation by definition, peaks, accuracy on uniform motion, and the hard cases."""
 
+import dataclasses
 import math
 
 import numpy as np
@@ -11,6 +12,7 @@ from geometry import Grid
 from torchsph.ultrasound.acquisition import Acquisition, Beams, Packet
 from torchsph.ultrasound.clutter import FIRFilter
 from torchsph.ultrasound.correlation import KernelShape, correlate, image_pairs
+from torchsph.ultrasound.echoes import EchoModel, simulate_packet
 from torchsph.ultrasound.estimates import Flag
 from torchsph.ultrasound.peak import find_peak
 from torchsph.ultrasound.tracking import SpeckleTracker
@@ -189,6 +191,43 @@ def test_clutter_of_sixty_decibel_is_filtered_away():
     assert found.power.median() < -50
 
 
+@dataclasses.dataclass(frozen=True)
+class BesideTissue:
+    """Blood moves for x < 0; beyond is tissue that creeps along the beam."""
+
+    velocity_of_blood: tuple
+    creep: float = 2e-3
+
+    def blood(self, points, time):
+        return points[:, 0] < 0
+
+    def velocity(self, points, time):
+        still = points.new_tensor((0.0, 0.0, self.creep))
+        return torch.where(self.blood(points, time)[:, None], points.new_tensor(self.velocity_of_blood), still)
+
+
+def test_blood_beside_tissue_of_sixty_decibel():
+    """Far from it blood is tracked, at its edge and inside it nothing is believed."""
+    flow, points = BesideTissue((0.1, 0.2, 0.25)), lattice(half=3)
+    scene = simulate_packet(
+        flow, cube(24), EchoModel(tissue=60.0), 0.0, torch.Generator().manual_seed(9), dtype=torch.float64
+    )
+    found = SpeckleTracker(max_snr=30.0, min_blood=-80.0).track(scene, points)
+    far, beyond = points[:, 0] < -2.5e-3, points[:, 0] > 0.5e-3
+    error = (found.velocity - flow.velocity(points, 0.0))[far & found.accepted]
+    assert found.accepted[far].double().mean() > 0.8 and not found.accepted[beyond].any()
+    assert error[:, 2].abs().median() < 0.01 and error[:, :2].abs().median() < 0.1
+
+
+def test_a_kernel_without_scatterers_is_flagged_alone():
+    scene, points = packet((0.2, 0.1, 0.1), 10, snr=None), lattice()
+    hole = (scene.grid.nodes() - torch.tensor([0.0, 0.0, 24e-3])).abs().amax(1) < 0.7e-3
+    found = PLAIN.track(scene.with_iq(torch.where(hole.view(scene.grid.shape), 0, scene.iq)), points)
+    empty = (points - torch.tensor([0.0, 0.0, 24e-3])).abs().amax(1) < 0.1e-3
+    assert flagged(found, Flag.WEAK).tolist() == empty.tolist()
+    assert found.accepted[~empty].float().mean() > 0.6 and not found.velocity[empty].any()
+
+
 def test_no_scatterers_and_a_constant_image_are_flagged():
     grid, points = cube(12), lattice(half=1)
     for value in (0.0, 1.0):
@@ -242,3 +281,50 @@ def test_options_are_checked():
     ):
         with pytest.raises(ValueError, match=message):
             SpeckleTracker(**options)
+
+
+# trends that published trackers show
+
+
+def test_shear_raises_the_error_and_takes_estimates_away():
+    points, median, accepted = lattice(), [], []
+    for rate in (0.0, 60.0, 200.0):
+        found = PLAIN.track(packet((0.2, 0.1, 0.25), 11, gradient=((0,) * 3, (0,) * 3, (rate, 0, 0))), points)
+        true = torch.tensor([0.2, 0.1, 0.25]) + torch.outer(points[:, 0].float(), torch.tensor([0, 0, rate]))
+        median.append(float((found.velocity - true)[:, :2].abs().median()))
+        accepted.append(float(found.accepted.float().mean()))
+    assert median[0] < 0.5 * median[1] and median[1] < median[2]
+    assert accepted[1] > 0.9 > 0.6 > accepted[2]
+
+
+def test_the_clutter_filter_empties_slow_axial_flow():
+    tracker, points, accepted = SpeckleTracker(), lattice(half=1), []
+    for axial in (0.01, 0.3):
+        found = tracker.track(packet((0.2, 0.1, axial), 12, clutter=40.0), points)
+        accepted.append(float(found.accepted.float().mean()))
+    assert accepted[0] < 0.1 and accepted[1] > 0.9
+
+
+def test_larger_kernels_correlate_the_error():
+    """At 1 mm: hardly for kernels of 1 mm, by more than 0.3 for those of 2.5 mm."""
+    axis = torch.arange(-3, 4, dtype=torch.float64) * 1e-3
+    points = torch.cartesian_prod(axis, axis) + torch.tensor([0.0, 20e-3])
+    correlation = []
+    for kernel in (1e-3, 2.5e-3):
+        tracker, product, square = SpeckleTracker(clutter=None, kernel=kernel, lags=(1,)), 0.0, 0.0
+        for seed in range(8):
+            scene = packet((0.32, 0.26), 20 + seed, grid=cube(30, (0.0, 20e-3)), beams=Beams((0.0, 1.0)))
+            error = (tracker.track(scene, points).velocity[:, 0] - 0.32).view(7, 7)
+            error = error - error.mean()
+            product, square = product + (error[:, 1:] * error[:, :-1]).mean(), square + error.square().mean()
+        correlation.append(float(product / square))
+    assert correlation[0] + 0.15 < correlation[1] and correlation[1] > 0.3
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device: the echo chain is tested on the CPU only")
+def test_the_chain_runs_on_a_cuda_device():
+    flow, points = BesideTissue((0.1, 0.2, 0.25)), lattice(half=1) - torch.tensor([3e-3, 0.0, 0.0])
+    scene = simulate_packet(flow, cube(24), EchoModel(), 0.0, torch.Generator("cuda").manual_seed(0))
+    there = SpeckleTracker().track(scene, points.cuda())
+    here = SpeckleTracker().track(dataclasses.replace(scene, iq=scene.iq.cpu()), points)
+    torch.testing.assert_close(there.velocity.cpu(), here.velocity, atol=2e-3, rtol=0)

@@ -48,7 +48,7 @@ def random_swirl(
     centre: tuple[float, ...], radius: float, speed: float, generator: torch.Generator,
     *, waves: int = 6, tissue_speed: float = 0.0,
 ) -> SwirlFlow:  # fmt: skip
-    """A swirl of RMS ``speed``, m/s, with wavelengths between one and three diameters of the ball.
+    """A swirl of RMS ``speed``, m/s, with wavelengths between half a diameter of the ball and three.
 
     Each component of the tissue's velocity is drawn with a deviation of ``tissue_speed``, m/s.
     """
@@ -61,7 +61,7 @@ def random_swirl(
     length = (
         2
         * radius
-        * (1 + 2 * torch.rand(waves, generator=generator, dtype=torch.float64, device=generator.device))
+        * (0.5 + 2.5 * torch.rand(waves, generator=generator, dtype=torch.float64, device=generator.device))
     )
     amplitude = normal(waves, dimension)
     amplitude = amplitude - (amplitude * direction).sum(1, keepdim=True) * direction
