@@ -98,7 +98,7 @@ def test_two_separate_peaks_are_told_by_their_ratio():
 
 @pytest.mark.parametrize("velocity", [(0.31, 0.17, 0.23), (-0.62, 0.44, 0.51)])
 def test_uniform_motion_is_measured_within_the_stated_error(velocity):
-    """Targets: |bias| <= 1 % of the speed, deviation <= 5 % lateral and 1 % axial of 1 m/s."""
+    """|bias| <= 1 % of the speed, deviation about 2 % lateral and 0.1 % axial of 1 m/s."""
     points, errors = lattice(), []
     for seed in range(3):
         found = PLAIN.track(packet(velocity, seed), points)
@@ -106,7 +106,7 @@ def test_uniform_motion_is_measured_within_the_stated_error(velocity):
         errors.append(found.velocity[found.accepted] - torch.tensor(velocity))
     error = torch.cat(errors)
     deviation = error.std(0)
-    assert (deviation[:2] < 0.03).all() and deviation[2] < 2e-3
+    assert (deviation[:2] < 0.022).all() and deviation[2] < 1.2e-3
     speed = math.hypot(*velocity)
     assert (error.mean(0).abs() < 0.01 * speed + 0.003).all()  # 375 points, some 60 of them independent
 

@@ -55,7 +55,8 @@ def draw_errors(results: dict, path: Path) -> None:
     axes[1, 3].set(xlabel="third of the weight, least first", ylabel="RMS of z-scores", ylim=(0, 3), xticks=[1, 2, 3])
     for axis in axes[1, 2:]:
         axis.grid(alpha=0.3)
-        axis.legend(fontsize=8)
+        if axis.lines:
+            axis.legend(fontsize=8)
     figure.suptitle("Speckle tracking errors: std (lines), |bias| (crosses), share of points not accepted (grey)")
     figure.savefig(path, dpi=90)
     plt.close(figure)

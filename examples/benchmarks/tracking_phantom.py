@@ -70,14 +70,15 @@ def draw(path: Path, true: geometry.Recording, measured: geometry.Recording, qua
     if quarter:
         plane = replace(plane, across=np.cross(plane.along, plane.across))
     shown = replace(measured, mask=measured.mask & (measured.weight > 0))
-    lines = -(-len(measured.time) // COLUMNS)
-    figure, axes = plt.subplots(2 * lines, COLUMNS, figsize=(2.2 * COLUMNS, 6.4 * lines), squeeze=False)
+    columns = min(COLUMNS, len(measured.time))
+    lines = -(-len(measured.time) // columns)
+    figure, axes = plt.subplots(2 * lines, columns, figsize=(2.2 * columns + 2, 6.4 * lines), squeeze=False)
     top = float(np.percentile(np.linalg.norm(true.velocity, axis=1)[true.mask], 99.7))
     for axis in axes.flat:
         axis.set_axis_off()
     for frame, moment in enumerate(measured.time):
         for row, recording in enumerate((true, shown)):
-            axis = axes[2 * (frame // COLUMNS) + row, frame % COLUMNS]
+            axis = axes[2 * (frame // columns) + row, frame % columns]
             picture = slices.cut(recording, recording.velocity[frame], frame, plane, 0.5e-3)
             image = axis.pcolormesh(1e3 * picture.across, 1e3 * picture.along, picture.speed, vmin=0, vmax=top)
             every = (slice(None, None, 3),) * 2

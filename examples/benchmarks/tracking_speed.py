@@ -6,7 +6,8 @@ The plain program goes point by point and pair by pair, with `scipy.signal.corre
 transforms, whichever is the faster here) and the same pooled normalisation, search and parabola. OpenPIV's
 three-dimensional correlation joins where it is installed; it gets every image pair of a smaller packet, since
 it has no packets. A packet of the phantom's size is simulated and tracked as well, and the memory that
-tracking takes is read off the process. Shorter of several interleaved runs: the machine may be shared.
+tracking takes is read off the process. All times are of the processor, the shortest of several interleaved runs,
+since the machine may be shared; set OMP_NUM_THREADS=1, or the threads add up.
 """
 
 from __future__ import annotations
@@ -67,13 +68,13 @@ def openpiv(packet: Packet, pairs: int) -> int:
 
 
 def shortest(programs: dict[str, Callable[[], object]], rounds: int) -> dict[str, float]:
-    """Seconds of each, the shortest of ``rounds`` interleaved runs."""
+    """Processor seconds of each, the shortest of ``rounds`` interleaved runs."""
     best = dict.fromkeys(programs, float("inf"))
     for _ in range(rounds):
         for name, program in programs.items():
-            start = time.perf_counter()
+            start = time.process_time()
             program()
-            best[name] = min(best[name], time.perf_counter() - start)
+            best[name] = min(best[name], time.process_time() - start)
     return best
 
 
@@ -118,16 +119,16 @@ def phantom(quick: bool) -> dict[str, float]:
     shape = tuple(round(shrink * side / STEP) + 13 for side in reversed(PHANTOM))
     origin = tuple(c - 0.5 * (n - 1) * STEP for c, n in zip(CENTRE, reversed(shape), strict=True))
     grid, generator = Grid(origin, (STEP,) * 3, shape), torch.Generator().manual_seed(0)
-    start = time.perf_counter()
+    start = time.process_time()
     packet = simulate_packet(LinearFlow((0.3, 0.2, 0.25)), grid, EchoModel(), 0.0, generator)
-    simulated = time.perf_counter() - start
+    simulated = time.process_time() - start
     points = grid.nodes().view(*shape, 3)[6:-6:6, 6:-6:6, 6:-6:6].reshape(-1, 3)
     rows = {"nodes": float(np.prod(shape)), "points": float(len(points)), "simulated (s)": simulated}
     few, before = points[:: max(len(points) // 100, 1)], resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     for name, some in (("100 points", few), ("all points", points)):
-        start = time.perf_counter()
+        start = time.process_time()
         SpeckleTracker().track(packet, some)
-        rows[f"tracked, {name} (s)"] = time.perf_counter() - start
+        rows[f"tracked, {name} (s)"] = time.process_time() - start
         rows[f"peak memory, {name} (MiB)"] = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024
     rows["packet (MiB)"] = packet.iq.element_size() * packet.iq.numel() / 2**20
     return rows
