@@ -40,7 +40,7 @@ def estimates(count, generator, variance):
     one = torch.ones(count)
     return Estimates(
         torch.zeros((count, 3)), 0.9 * one, 2 * one, torch.ones((count, 3)),
-        variance[:, None].expand(-1, 3), 0 * one, 20 * one, 0 * one,
+        variance[:, None].expand(-1, 3), 0 * one, 20 * one, 0 * one, 10 * one,
         torch.ones(count, dtype=torch.long), torch.zeros(count, dtype=torch.int32),
     )  # fmt: skip
 

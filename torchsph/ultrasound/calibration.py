@@ -63,8 +63,8 @@ class Calibration:
 
 
 def features(estimates: Estimates, beam: Tensor, axial: bool) -> Tensor:
-    """What the log variance is linear in, (n, 7): 1, predicted log variance, log(1 - rho), log peak ratio, and in
-    10 dB the SNR, the share of power passed by the clutter filter and its response to the velocity found.
+    """What the log variance is linear in, (n, 8): 1, predicted log variance, log(1 - rho), log peak ratio, log shear,
+    and in 10 dB the SNR, the share of power passed by the clutter filter and its response to the velocity.
 
     All bounded, so that an odd estimate cannot ask for an absurd deviation. An unknown SNR counts as 20 dB.
     """
@@ -76,7 +76,9 @@ def features(estimates: Estimates, beam: Tensor, axial: bool) -> Tensor:
     snr = torch.nan_to_num(estimates.snr, nan=20.0).clamp(-10, 40) / 10
     power = torch.nan_to_num(estimates.power, nan=0.0).clamp(-60, 5) / 10
     response = torch.nan_to_num(estimates.response, nan=0.0).clamp(-20, 0) / 10
-    return torch.stack([torch.ones_like(predicted), predicted, decorrelation, ratio, snr, power, response], 1)
+    shear = torch.nan_to_num(estimates.shear, nan=10.0).clamp(10.0, 300.0).log()
+    one = torch.ones_like(predicted)
+    return torch.stack([one, predicted, decorrelation, ratio, shear, snr, power, response], 1)
 
 
 def fit_calibration(estimates: Estimates, error: Tensor, beam: Tensor) -> Calibration:

@@ -38,8 +38,9 @@ class Estimates:
     (n, D): (m/s)^2 up to a constant, what correlation and curvature say of the precision; calibration makes a
     ``sigma`` of it. power (n,): share of the unfiltered power that passed the clutter filter, dB. snr
     (n,): power over thermal noise after the filter, dB (NaN if the noise is unknown). response (n,): of the
-    clutter filter at the Doppler frequency of the velocity, dB. lag (n,): images between those compared.
-    flags (n,): :class:`Flag` bits, 0 = accepted.
+    clutter filter at the Doppler frequency of the velocity, dB. shear (n,): size of the axial velocity's
+    gradient, 1/s (NaN if it was not looked for). lag (n,): images between those compared. flags (n,):
+    :class:`Flag` bits, 0 = accepted.
     """
 
     velocity: Tensor
@@ -50,6 +51,7 @@ class Estimates:
     power: Tensor
     snr: Tensor
     response: Tensor
+    shear: Tensor
     lag: Tensor
     flags: Tensor
 

@@ -53,6 +53,14 @@ class Prepared:
         z, y, x = (corner + corner.new_tensor(self.shape.half)).unbind(1)
         return self.turn_gradient[z, y, x]
 
+    def shear(self, corner: Tensor) -> Tensor:
+        """Size (P,), 1/s, of the gradient of the axial velocity in kernels; NaN where it was not asked for."""
+        ramp = self.ramp(corner)
+        if ramp is None:
+            return self.power.new_full((len(corner),), math.nan)
+        acquisition = self.packet.acquisition
+        return (ramp / self.spacing).norm(dim=1) / (acquisition.phase_per_metre * acquisition.interval)
+
     def holds(self, nodes: Tensor) -> Tensor:
         """Whether kernels around ``nodes`` (P, 3), and one node beyond, lie inside the image: (P,) bool."""
         last = nodes.new_tensor([1] * (3 - self.packet.grid.dimension) + list(self.packet.grid.shape)) - 1

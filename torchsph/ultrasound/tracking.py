@@ -121,7 +121,8 @@ def _track_tile(
         peak_ratio=spread(motion.peak_ratio, 1.0), curvature=spread(motion.curvature[:, axes], 0.0),
         # of what was not correlated nothing is known but that it is within the range
         variance=spread(motion.variance[:, axes] / interval**2, options.search**2),
-        power=share, snr=snr, response=spread(response, 0.0), lag=spread(motion.lag, pairs[0].apart), flags=flags,
+        power=share, snr=snr, response=spread(response, 0.0), shear=images.shear(corner),
+        lag=spread(motion.lag, pairs[0].apart), flags=flags,
     )  # fmt: skip
 
 
