@@ -1,6 +1,6 @@
 """Speckle tracking of a ventricle's echoes: figures 4.4 and 4.5 of the thesis, calibration, and the whole loop.
 
-    python examples/benchmarks/tracking_phantom.py TRUE.h5 [--every K] [--loop] [--out FOLDER] [--json FILE] [--quick]
+    python examples/benchmarks/tracking_phantom.py TRUE.h5 [--first F --last F --every K] [--loop] [--out FOLDER] [--json FILE] [--quick]
 
 TRUE.h5: a recording of the true flow, which neither tracker nor calibration has seen. Its echoes are simulated
 and tracked as `torchsph measure --mode speckle` does; the estimates are drawn in two planes through the long
@@ -99,6 +99,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("true", type=Path, metavar="TRUE.h5")
     parser.add_argument("--every", type=int, default=5, metavar="K", help="each K-th frame (default: 5)")
+    parser.add_argument("--first", type=int, default=0, metavar="F", help="first frame (default: 0)")
+    parser.add_argument("--last", type=int, metavar="F", help="last frame")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--members", type=int, metavar="N", help="of the ensemble")
     parser.add_argument("--loop", action="store_true", help="spline and ensemble too")
@@ -108,7 +110,8 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="two frames, small training")
     arguments = parser.parse_args()
     whole = geometry.read_recording(arguments.true)
-    frames = list(range(0, whole.frames, arguments.every))
+    last = whole.frames - 1 if arguments.last is None else arguments.last
+    frames = list(range(arguments.first, last + 1, arguments.every))
     options = SpeckleOptions()
     if arguments.quick:
         frames, options = frames[:2], replace(options, training=2)
