@@ -21,6 +21,7 @@ from .transfer import fill_beyond
 from .units import Units
 from .wallfield import WallFields
 from .walls import WallSample
+from .work import energy_unit
 
 # a particle this far beyond a wall (spacings) counts as outside; the soft potential is meant to be entered a little
 _OUTSIDE = 0.5
@@ -38,6 +39,7 @@ class Domain:
         self.scene, self.scheme, self.units = scene, scheme, units
         self.device, self.dtype = device, dtype
         smoothing = kernel(scheme.kernel)
+        self._energy = energy_unit(units, scene.fluid.density, scene.dimension)
         self.support_radius = smoothing.support * scheme.smoothing_ratio
         self.period = self._period()
         self._steady_gravity = None
@@ -155,6 +157,11 @@ class Domain:
         """Set the present time of the members, s: (members,) float64 or one for all."""
         self._times = torch.as_tensor(times, dtype=torch.float64, device=self.device)
 
+    def later(self, particles: Particles, step: Tensor) -> Particles:
+        """Go on by ``step`` (members,), internal; the particles with what buffers do at that time."""
+        self.at(self.member_times(particles.members) + step.double() * self.units.time)
+        return self.reservoirs.driven(particles) if self.reservoirs is not None and self._open else particles
+
     def time_of(self, particles: Particles) -> Tensor:
         """Present time of each particle's member, s, (N,) float64."""
         return self.member_times(particles.members).index_select(0, particles.member)
@@ -173,14 +180,14 @@ class Domain:
             share = (self._times - early) / (late - early)
             fraction = share.clamp(0.0, 1.0).to(self.dtype)
             fraction = per_particle(fraction, particles.member) if fraction.ndim else fraction
-        return self.walls.sample(self._fields, fraction, self._wrapped_points(particles.position))
+        return self.walls.sample(self._fields, fraction, self.wrapped(particles.position))
 
     def sample_at(self, position: Tensor) -> WallSample:
         """Walls at points (n, D), internal, at the present time (one for all members)."""
         early, late = self._bracket
         share = float((self._times.max() - early) / (late - early)) if late > early else 0.0
         fraction = torch.full((), min(max(share, 0.0), 1.0), dtype=self.dtype, device=self.device)
-        return self.walls.sample(self._fields, fraction, self._wrapped_points(position))
+        return self.walls.sample(self._fields, fraction, self.wrapped(position))
 
     def body_force(self, particles: Particles) -> Tensor | None:
         """Acceleration (N, D) by gravity and pressure sources, or None."""
@@ -191,6 +198,10 @@ class Domain:
         if push is None or total is None:
             return total if push is None else push
         return total + push
+
+    def shortfall(self, particles: Particles) -> Tensor:
+        """By how much (N,), per time, the volume of a member's particles should grow to fill the cavity."""
+        return per_particle(self.reservoirs.shortfall(particles), particles.member)
 
     def _gravity(self, particles: Particles) -> Tensor | None:
         """Gravity at the particles' present times (N, D) or None."""
@@ -253,6 +264,8 @@ class Domain:
         record.crossed_wall.index_add_(0, after.member[near], (distance < 0).to(torch.int64))
         velocity = after.velocity[near]
         towards = ((velocity - wall.velocity[near]) * normal).sum(1).clamp_max(0.0)
+        done = -(after.mass[near] * towards * (normal * wall.velocity[near]).sum(1)).double() * self._energy
+        record.wall_work.index_add_(0, after.member[near], done.nan_to_num(0.0, 0.0, 0.0))
         return after.changed(
             position=after.position.index_add(0, near, (gap - distance)[:, None] * normal),
             velocity=after.velocity.index_add(0, near, -towards[:, None] * normal),
@@ -260,10 +273,10 @@ class Domain:
 
     def _wrapped(self, particles: Particles) -> Particles:
         return particles if self.period is None else particles.changed(
-            position=self._wrapped_points(particles.position)
+            position=self.wrapped(particles.position)
         )
 
-    def _wrapped_points(self, position: Tensor) -> Tensor:
+    def wrapped(self, position: Tensor) -> Tensor:
         """Points (n, D), internal, brought back into the periodic box."""
         if self.period is None:
             return position
@@ -271,14 +284,35 @@ class Domain:
         length = torch.where(finite, self.period, torch.ones_like(self.period))
         return torch.where(finite, torch.remainder(position, length), position)
 
-    def account(self, particles: Particles, record: Record, time: float) -> None:
-        """Count the particles that are beyond the walls now."""
+    def shortest(self, way: Tensor) -> Tensor:
+        """Differences (n, D) of positions, internal, the shortest way around the periodic box."""
+        if self.period is None:
+            return way
+        finite = torch.isfinite(self.period)
+        length = torch.where(finite, self.period, torch.ones_like(self.period))
+        return torch.where(finite, way - length * torch.round(way / length), way)
+
+    def beyond_valves(self, position: Tensor) -> Tensor:
+        """(n,) bool: points (n, D), internal, at an open valve or behind it, where the walls' distance knows no end."""
+        beyond = torch.zeros_like(position[:, 0], dtype=torch.bool)
+        if self.reservoirs is not None:
+            for _, frame in self.reservoirs.active():
+                beyond |= frame.behind(position)
+        if self.sources is not None:
+            for region in self._open:
+                beyond |= self.sources.behind(position, region, self.middle)
+        return beyond
+
+    def account(self, particles: Particles, record: Record, time: float, since: float) -> None:
+        """Count the particles beyond the walls now, at ``time`` (s), and the volumes; the run began at ``since``."""
         self.at(time)
         wall = self.sample(particles)
         if wall is not None:
             beyond = (wall.distance < -_OUTSIDE) & particles.fluid
             record.outside = particles.per_member(beyond.to(torch.int64), "sum")
             record.filling = self.filling(particles, time)
+            if self.scene.walls.moves:
+                record.cavity_change.fill_(self.fluid_volume(time) - self.fluid_volume(since))
 
     def imposed(self, particles: Particles, grid: Grid, velocity: Tensor, mask: Tensor, time: float) -> Particles:
         """Particles with the velocity of a grid field, continued beyond its mask by the walls' velocity."""

@@ -95,6 +95,13 @@ class Reservoirs:
         filled = particles.per_member((part * particles.mass).double(), "sum")
         return (self._looked_up(self.volume, times, torch.float64) - filled).to(self.domain.dtype)
 
+    def shortfall(self, particles: Particles) -> Tensor:
+        """Share of the cavity's volume, per time, that should come in for what particles lack, (members,)."""
+        times = self.domain.member_times(particles.members)
+        if self.relaxation is None:
+            return torch.zeros_like(times, dtype=self.domain.dtype)
+        return self._deficit(particles, times) / (self._looked_up(self.volume, times) * self.relaxation)
+
     def frame(self, number: int) -> Frame:
         """Opening ``number`` in the middle of the present interval (openings move little within one)."""
         time = self.domain.middle
@@ -174,6 +181,16 @@ class Reservoirs:
         total = particles.per_member(weight * particles.deviation, "sum")
         return (total / particles.per_member(weight, "sum").clamp_min(1.0))[members]
 
+    @staticmethod
+    def _mouth_pressure(
+        particles: Particles, frame: Frame, pressure: Callable[[Particles], Tensor]
+    ) -> Callable[[Particles], Tensor]:
+        """Mean pressure of the fluid near an orifice, which buffers of the incompressible scheme have none of."""
+        near = particles.select(((particles.position - frame.centre).norm(dim=1) < frame.radius) & particles.fluid)
+        total = near.per_member(pressure(near), "sum")
+        mean = total / near.per_member(torch.ones_like(near.mass), "sum").clamp_min(1.0)
+        return lambda some: mean.index_select(0, some.member)
+
     def driven(self, particles: Particles, *, channel: bool = False) -> Particles:
         """Give the buffers' particles their velocity for the present time; with ``channel`` also the free channels'."""
         times = self.domain.member_times(particles.members)
@@ -247,10 +264,12 @@ class Reservoirs:
             ):
                 if not bool(which.any()):
                     continue
-                some = particles.select(which)
+                some, level = particles.select(which), pressure
+                if which is entered and particles.pressure is not None and number not in self.given:
+                    level = self._mouth_pressure(particles, frame, pressure)
                 counter[:, valve] += some.per_member(torch.ones_like(some.member), "sum")
                 volume[:, valve] += some.per_member(some.mass.double(), "sum") * unit
-                energy[:, valve] += some.per_member(carried_energy(some, pressure(some)), "sum") * self._energy
+                energy[:, valve] += some.per_member(carried_energy(some, level(some)), "sum") * self._energy
         particles = particles.changed(kind=kind)
         if not fresh and not bool(gone.any()):
             return particles, False
@@ -312,6 +331,12 @@ class Frame:
     def inset(self, position: Tensor) -> Tensor:
         """In-plane distance from the rim, (n,), positive over the opening."""
         return self._plane.lateral_distance(position)
+
+    def behind(self, position: Tensor) -> Tensor:
+        """(n,) bool: points (n, D) less than half a spacing before the opening, or in the channel behind it."""
+        height = self.height(position)
+        aside = (position - self.centre - height[:, None] * self.normal).norm(dim=1)
+        return (height > -0.5) & (aside < self.radius + 1.0)
 
     def lattice(self, length: float) -> Tensor:
         """Unit lattice in the channel of the given length behind the opening, (n, D)."""

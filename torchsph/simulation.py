@@ -18,6 +18,7 @@ from .neighbours import PairSearch
 from .pairs import backend as choose_backend
 from .parameters import Coefficients, Parameters
 from .particles import Particles
+from .population import Population
 from .pressure_valves import PressureValves
 from .projection import Neighbourhood, ProjectionStepper, check_filled, divergence_free
 from .record import Record
@@ -69,11 +70,12 @@ class Simulation:
             self._stepper = Stepper(scheme, self._coefficients, search, scene.dimension, buffered=buffered)
         self._control = StepControl(self.record, scheme.step_floor)
         self._work = WorkAccount.of(self.domain, self.record)
+        self._population = Population.of(self.domain, self._backend, self.record, particles, self.time)
         self._pressures = PressureValves.of(self.domain, self._backend)
         if self._pressures is not None:
             self._stepper.held_kinds = self._pressures.kinds
         self._acceleration = torch.zeros_like(particles.position)
-        self._imposed_at = self.time
+        self._began_at = self._imposed_at = self.time
         self._order: Tensor | None = None  # of the particles in space when they were last sorted
         self._sort_at = 0  # number of searches at which they are sorted again
 
@@ -107,7 +109,7 @@ class Simulation:
         self._unsort()
         self.record.searches = self._stepper.pair_search.searches
         self.record.overflows = self._backend.overflows
-        self.domain.account(self.particles, self.record, self.time)
+        self.domain.account(self.particles, self.record, self.time, self._began_at)
 
     def _longest_step(self, until: float) -> float:
         """Limit of the steps to time ``until`` (s) that the scheme names outright, internal."""
@@ -158,6 +160,8 @@ class Simulation:
             )
             self.domain.at(self.time + done * self.units.time)
             self._pass_valves()
+            if self._population is not None:
+                self._control_population(step > 0)
             if self._pressures is not None:
                 self.particles = self._pressures.driven(self.particles, self._stepper)
             self._sort_when_due()
@@ -177,12 +181,18 @@ class Simulation:
 
     def _pass_valves(self) -> None:
         """Particles that have crossed an open valve change sides, in every step: the flow must not feel the search."""
-        before = self.particles.count
         self.particles, renumbered = self.domain.exchange(self.particles, self.record, self._stepper.pressure)
         if renumbered:
             self._forget_pairs()
-        if self.particles.count != before:
-            self._acceleration = torch.zeros_like(self.particles.position)
+
+    def _control_population(self, active: Tensor) -> None:
+        """Merge and seed particles in the members (members,) bool whose turn it is."""
+        due = active & (self.record.steps % self._population.options.every == 0)
+        if not bool(due.any()):
+            return
+        self.particles, changed = self._population.controlled(self.particles, due)
+        if changed:
+            self._forget_pairs()
 
     def _sort_when_due(self) -> None:
         """Now and then, where the neighbours are to be searched anyway, sort large sets in space."""
@@ -225,7 +235,7 @@ class Simulation:
         self.record.note_density(lowest, highest)
         broken = self._broken(lowest, highest) & ~self.record.failed
         if self._work is not None:
-            self._work.note(before, stepped, after, wall, inner, self._stepper, (step > 0) & ~broken)
+            self._work.note(before, stepped, wall, inner, self._stepper, (step > 0) & ~broken)
         if bool(broken.any()):
             done = self._recover(broken, before, push, done, checkpoints)
         return done

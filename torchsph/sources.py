@@ -93,6 +93,10 @@ class Sources:
             gone |= out
         return particles.select(~gone) if bool(gone.any()) else particles
 
+    def behind(self, position: Tensor, region: int, time: float) -> Tensor:
+        """(n,) bool: points (n, D) less than half a spacing before the plane of an orifice, or behind it."""
+        return ((position - self._at(region, time, 0)) * self._at(region, time, 1)).sum(1) > -0.5
+
     def _account(
         self, gone: Particles, valve: int, record: Record, pressure: Callable[[Particles], Tensor]
     ) -> None:

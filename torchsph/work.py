@@ -41,14 +41,13 @@ class WorkAccount:
     Pressure does the work  int p v_wall . n dA,  as a sum over the particles whose kernels the wall cuts: the kernel's
     integral over the wall is the gradient of its share inside (Ferrand et al. 2013), and half of a kernel centred on a
     plane wall lies inside. Where the wall is curved or folded that half is off by the curvature over a kernel's radius.
-    A potential wall does the work of its force and of its retardation, which is exact.
+    A potential wall does the work of its force and of its retardation, which is exact. What walls do to particles that
+    they stop outright is added where that happens (``Domain.constrain``).
     """
 
     def __init__(self, domain: Domain, record: Record) -> None:
-        self._record, self._wall, self._reach = record, domain.scheme.wall, domain.support_radius
+        self._record, self._wall = record, domain.scheme.wall
         self._friction = isinstance(self._wall, CompleteKernelWall) and self._wall.no_slip
-        if isinstance(self._wall, PotentialWall):
-            self._reach = self._wall.reach
         self._sources = domain.sources
         self._moving = domain.walls is not None and bool(domain.scene.walls.rates_at_keys.any())
         self._unit = energy_unit(domain.units, domain.scene.fluid.density, domain.scene.dimension)
@@ -60,47 +59,45 @@ class WorkAccount:
         return account if account._moving or account._sources is not None else None
 
     def note(
-        self, before: Particles, stepped: Particles, after: Particles, wall: WallSample | None, step: Tensor,
+        self, before: Particles, stepped: Particles, wall: WallSample | None, step: Tensor,
         stepper: Stepper | ProjectionStepper, counts: Tensor,
     ) -> None:
         """Account for one step.
 
         Args:
-            before, stepped, after: the particles before the step, after it, and after walls have stopped them.
+            before, stepped: the particles before the step and after it, not yet stopped by walls.
             wall: what they saw. step: (members,), internal. counts: (members,) bool, whose steps were taken.
         """
         if self._moving and wall is not None:
-            self._add("wall_work", self._by_walls(before, stepped, after, wall, step, stepper), counts)
+            power = self._power_of_walls(before, stepped, wall, step, stepper) * stepped.mass * stepped.inside
+            self._add("wall_work", stepped.per_member(power, "sum"), step, counts)
         if self._sources is not None and self._sources.push is not None:
-            mean = 0.5 * (before.velocity + stepped.velocity)
-            gained = per_particle(step, before.member) * (self._sources.push * mean).sum(1) * before.mass
-            self._add("source_work", before.per_member(gained.double(), "sum"), counts)
+            power = 0.5 * before.mass * (self._sources.push * (before.velocity + stepped.velocity)).sum(1)
+            self._add("source_work", before.per_member(power.double(), "sum"), step, counts)
 
-    def _add(self, name: str, work: Tensor, counts: Tensor) -> None:
-        """Add (members,) of internal work to an account."""
-        getattr(self._record, name).add_(torch.where(counts, work * self._unit, torch.zeros_like(work)))
+    def _add(self, name: str, power: Tensor, step: Tensor, counts: Tensor) -> None:
+        """Add what a power (members,), internal, does in a step to an account."""
+        work = power.double() * step.double() * self._unit
+        getattr(self._record, name).add_(torch.where(counts, work, torch.zeros_like(work)))
 
-    def _by_walls(
-        self, before: Particles, stepped: Particles, after: Particles, wall: WallSample, step: Tensor,
+    def _power_of_walls(
+        self, before: Particles, stepped: Particles, wall: WallSample, step: Tensor,
         stepper: Stepper | ProjectionStepper,
     ) -> Tensor:
-        """Work (members,) float64 of the walls on the particles inside, internal."""
-        row = torch.nonzero((wall.distance < self._reach) & before.inside).squeeze(1)
-        near = WallSample(*(None if part is None else part[row] for part in vars(wall).values()))
-        mine, c = stepped.select(row), stepper.coefficients
-        dt = per_particle(step, mine.member)
-        impulse = after.velocity[row] - mine.velocity
+        """Power per mass (N,) of the walls on the particles, internal; few passes, because every step pays for them."""
+        c = stepper.coefficients
         if isinstance(self._wall, PotentialWall):
-            sound = per_particle(c.sound_speed, mine.member)
-            impulse = impulse + dt[:, None] * potential_force(self._wall, sound, near)
+            sound = per_particle(c.sound_speed, stepped.member)
+            force = potential_force(self._wall, sound, wall)
             if self._wall.relaxation is not None:
                 # a step backwards from where it has led gives what it has changed
-                impulse = impulse + mine.velocity - retardation(self._wall, sound, -dt, mine.velocity, near)
-        elif self._friction and c.viscosity is not None:
-            drag = friction(per_particle(c.viscosity, mine.member), before.velocity[row], near)
-            impulse = impulse + dt[:, None] * drag
-        work = mine.mass * (impulse * near.velocity).sum(1)
-        if near.share_gradient is not None:
-            swept = (near.velocity * near.share_gradient).sum(1) if near.swept is None else near.swept
-            work = work + 2.0 * dt * mine.mass * stepper.pressure(mine) / (1.0 + mine.deviation) * swept
-        return mine.per_member(work.double(), "sum")
+                dt = per_particle(step, stepped.member)
+                change = stepped.velocity - retardation(self._wall, sound, -dt, stepped.velocity, wall)
+                force = force + change / dt.clamp_min(torch.finfo(dt.dtype).tiny)[:, None]
+            return (force * wall.velocity).sum(1)
+        swept = (wall.velocity * wall.share_gradient).sum(1) if wall.swept is None else wall.swept
+        power = 2.0 * stepper.pressure(stepped) / (1.0 + stepped.deviation) * swept
+        if self._friction and c.viscosity is not None:
+            drag = friction(per_particle(c.viscosity, stepped.member), before.velocity, wall)
+            power = power + (drag * wall.velocity).sum(1)
+        return power
