@@ -94,6 +94,9 @@ def test_fluid_out_of_a_reservoir_reaches_bernoullis_speed(scheme, options):
     _, u = inside(run)
     assert np.sqrt(np.mean((u - exact) ** 2)) < 0.04 * exact
     assert u.mean() == pytest.approx(exact, rel=0.04)
+    p, r = run.particles, run.record
+    energy = 0.5 * float((p.mass * p.velocity.square().sum(1))[p.inside].sum()) * run.units.length**2
+    assert float(r.energy_in.sum() - r.energy_out.sum()) == pytest.approx(energy, rel=0.1)  # nothing else does work
     assert healthy(run)
 
 

@@ -120,6 +120,9 @@ def _measure(parser: Parser, _: tuple[str, ...]) -> None:
     echoes.add_argument("--snr", type=number(-100), metavar="DB", help="of the blood's echoes")
     echoes.add_argument("--prf", type=number(0, open_below=True), metavar="HZ", help="pulses per second")
     echoes.add_argument("--packet", type=whole(2), metavar="N", help="frames of echoes per estimate")
+    echoes.add_argument(
+        "--apex", type=float, nargs="+", metavar="M", help="x, y, z: beams fan out from there; else parallel"
+    )
     echoes.add_argument("--clutter", type=number(0), metavar="DB", help="tissue over blood inside the cavity")
     parser.add_argument(
         "--seed", type=whole(0), default=0, metavar="N", help="of everything random (%(default)s)"

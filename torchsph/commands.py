@@ -24,7 +24,7 @@ from torchsph.smooth import smooth as smooth_recording
 
 __all__ = ["COMMANDS"]
 
-MEASURE_FLAGS = ("every", "lateral", "axial", "outliers", "snr", "prf", "packet", "clutter")
+MEASURE_FLAGS = ("every", "lateral", "axial", "outliers", "snr", "prf", "packet", "clutter", "apex")
 
 
 def assimilate(args: argparse.Namespace) -> None:
