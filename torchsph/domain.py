@@ -150,6 +150,11 @@ class Domain:
         """Set the present time of the members, s: (members,) float64 or one for all."""
         self._times = torch.as_tensor(times, dtype=torch.float64, device=self.device)
 
+    @property
+    def now(self) -> float:
+        """Present time, s, on the average over the members."""
+        return float(self._times.mean())
+
     def time_of(self, particles: Particles) -> Tensor:
         """Present time of each particle's member, s, (N,) float64."""
         return self.member_times(particles.members).index_select(0, particles.member)
@@ -222,7 +227,7 @@ class Domain:
         which is far below a spacing, so that one look-up per step does.
         """
         if self.reservoirs is not None and self._open:
-            after = self.reservoirs.driven(after)
+            after = self.reservoirs.driven(after, step)
         if wall is None or not isinstance(self.scheme.wall, CompleteKernelWall):
             return after
         dt = per_particle(step, after.member)
@@ -275,7 +280,7 @@ class Domain:
         else:
             points = particles.position
         particles = particles.changed(velocity=self.sampled(particles, grid, field, points))
-        return particles if self.reservoirs is None else self.reservoirs.driven(particles, channel=True)
+        return particles if self.reservoirs is None else self.reservoirs.driven(particles)
 
     def sampled(
         self, particles: Particles, grid: Grid, field: Tensor, position: Tensor | None = None

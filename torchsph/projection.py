@@ -32,6 +32,8 @@ _TINY = 1e-6
 _SHARES = 16
 # a displacement of more than this (spacings) would outrun the linearisation
 _LARGEST_MOVE = 0.2
+# part of a full kernel's moment below which no slope is drawn from what is left of it
+_SMALLEST_MOMENT = 0.3
 
 
 @dataclass(frozen=True)
@@ -75,6 +77,30 @@ class Neighbourhood:
         mean = filling.new_zeros(size).index_add(0, group, weight * filling) / count.clamp_min(1.0)
         excess = (filling / mean[group].clamp_min(_TINY) - 1.0).clamp(-_LARGEST_EXCESS, _LARGEST_EXCESS)
         return torch.where(counted, excess, torch.zeros_like(excess))
+
+    def wall_jump(self) -> Tensor:
+        """What the divergence at walls lacks, as a source (N,): half of the jump from the fluid's speed to the wall's.
+
+        Of a jump at the wall the kernels of the fluid see the half that lies on their side; a wall that accelerates
+        would so be followed by halves only. The fluid's normal velocity is continued linearly to the wall first, so
+        that a flow that keeps to the wall has no jump.
+        """
+        p, wall = self.particles, self.wall
+        steep = wall.share_gradient.norm(dim=1)
+        terms = MomentumTerms(pressure="difference")
+        along = (p.velocity * wall.normal).sum(1)
+        fall = self.search.backend.momentum(self.pairs, p.state(along), self.support, terms)
+        # the sum's own moment across a plane wall, by the divergence theorem
+        moment = (wall.share - wall.distance * steep).clamp_min(_SMALLEST_MOMENT)
+        rise = -(fall * wall.normal).sum(1) / moment
+        jump = (wall.velocity * wall.normal).sum(1) - along + wall.distance.clamp_min(0.0) * rise
+        return torch.where(p.fluid, jump * steep / self.share, torch.zeros_like(jump))
+
+    def divergence(self, sums: Rates) -> tuple[Tensor, Tensor | None]:
+        """Velocity divergence (N,) for the pressure to answer, and the crowding gradient (N, D), complete at walls."""
+        p, wall = self.particles, self.wall
+        divergence, crowding = completed(sums.divergence, sums.concentration, p.velocity, wall)
+        return (divergence if wall is None else divergence - self.wall_jump()), crowding
 
     def push(
         self, source: Tensor, start: Tensor | None, surface: Tensor | None, tolerance: float, iterations: int
@@ -143,7 +169,7 @@ def divergence_free(
     particles = around.particles
     for _ in range(times):
         now = Neighbourhood(particles, around.search, around.pairs, around.support, around.wall)
-        divergence, _ = completed(now.rates(RateTerms()).divergence, None, particles.velocity, around.wall)
+        divergence, _ = now.divergence(now.rates(RateTerms()))
         push, found = now.push(-divergence, None, None, tolerance, iterations)
         particles = particles.changed(velocity=particles.velocity + push)
     return particles.velocity, found
@@ -212,7 +238,7 @@ class ProjectionStepper:
             particles = particles.changed(velocity=torch.where(particles.fluid[:, None], moved, before))
         here = Neighbourhood(particles, self.pair_search, pairs, self.support, wall)
         sums = here.rates(self._terms)
-        divergence, crowding = completed(sums.divergence, sums.concentration, particles.velocity, wall)
+        divergence, crowding = here.divergence(sums)
         surface, source = None, -divergence
         filling = here.filling(sums) if self._terms.shepard else None
         if self.scheme.surface is not None:
