@@ -16,6 +16,16 @@ def to_single(band: torch.Tensor) -> torch.Tensor:
     return single
 
 
+def dense_block(band: torch.Tensor, row: int, column: int) -> torch.Tensor:
+    """Block (rows row.., columns column.., at most as wide as the band each) of the lower triangle."""
+    count, width = band.shape
+    i = torch.arange(row, min(row + width, count), device=band.device)[:, None]
+    j = torch.arange(column, min(column + width, count), device=band.device)
+    offset = i - j
+    inside = (offset >= 0) & (offset < width)
+    return torch.where(inside, band[j.expand_as(offset), offset.clamp(0, width - 1)], 0.0)
+
+
 def widen(scalar: torch.Tensor, scale: torch.Tensor) -> torch.Tensor:
     """Band of kron(scalar matrix, diag(scale)): component c of every coefficient is scaled by scale (C,)."""
     n, width = scalar.shape

@@ -7,6 +7,7 @@ is faster (it skips the zeros of the outer blocks); there this class serves as t
 
 import torch
 
+from .banded import dense_block
 from .errors import InvalidInput
 from .ordering import Ordering
 
@@ -16,14 +17,14 @@ class BlockFactor:
 
     def __init__(self, band: torch.Tensor, ordering: Ordering) -> None:
         self.ordering = ordering
-        self._size = band.shape[1]
+        self.size = band.shape[1]  # of its blocks
         self._lower: list[torch.Tensor] = []
         self._below: list[torch.Tensor] = []  # block (k, k - 1) of the factor
-        for start in range(0, len(band), self._size):
-            diagonal = self._dense(band, start, start)
+        for start in range(0, len(band), self.size):
+            diagonal = dense_block(band, start, start)
             diagonal = diagonal + torch.tril(diagonal, -1).mT
             if start > 0:
-                below = self._dense(band, start, start - self._size)
+                below = dense_block(band, start, start - self.size)
                 below = torch.linalg.solve_triangular(self._lower[-1], below.mT, upper=False).mT
                 diagonal = diagonal - below @ below.mT
                 self._below.append(below)
@@ -39,7 +40,7 @@ class BlockFactor:
         """(active, C) or (active, C, k) in solve order -> the same shape."""
         flat = right.to(self._lower[0]).reshape(right.shape[0] * right.shape[1], -1)
         parts: list[torch.Tensor] = []
-        for k, part in enumerate(flat.split(self._size)):
+        for k, part in enumerate(flat.split(self.size)):
             if k > 0:
                 part = part - self._below[k - 1] @ parts[-1]
             parts.append(torch.linalg.solve_triangular(self._lower[k], part, upper=False))
@@ -50,6 +51,15 @@ class BlockFactor:
             parts[k] = torch.linalg.solve_triangular(self._lower[k].mT, part, upper=True)
         return torch.cat(parts).view(right.shape)
 
+    @property
+    def blocks(self) -> int:
+        """How many blocks its diagonal has."""
+        return len(self._lower)
+
+    def block(self, row: int, column: int) -> torch.Tensor:
+        """Block of the factor on the diagonal, or just below it."""
+        return self._lower[row] if row == column else self._below[column]
+
     def diagonal(self) -> torch.Tensor:
         """(unknowns,) squares of the factor's diagonal."""
         return torch.cat([lower.diagonal() for lower in self._lower]).square()
@@ -57,13 +67,3 @@ class BlockFactor:
     def log_determinant(self) -> float:
         """Natural logarithm of the determinant of the normal matrix."""
         return float(self.diagonal().log().sum())
-
-    def _dense(self, band: torch.Tensor, row: int, column: int) -> torch.Tensor:
-        """Block (rows row.., columns column..) of the lower triangle as a dense matrix."""
-        count, width = band.shape
-        i = torch.arange(row, min(row + self._size, count), device=band.device)[:, None]
-        j = torch.arange(column, min(column + self._size, count), device=band.device)
-        offset = i - j
-        inside = (offset >= 0) & (offset < width)
-        values = band[j.expand_as(offset), offset.clamp(0, width - 1)]
-        return torch.where(inside, values, 0.0)

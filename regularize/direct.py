@@ -8,7 +8,7 @@ from scipy.linalg.blas import dtbmv
 
 from . import cholesky, gram_triton, native
 from .assembly import reference_band
-from .banded import to_single
+from .banded import dense_block, to_single
 from .block import BlockFactor
 from .errors import InvalidInput, NotConverged
 from .krylov import Solution
@@ -50,6 +50,14 @@ class PreparedSystem:
         if self._packed is not None:
             other._packed = copy(self._packed)
             other._packed.system = system
+        return other
+
+    def with_weights(self, system: System) -> "PreparedSystem":
+        """The same points in the same order with the weights and right-hand sides of ``system``."""
+        other = copy(self)
+        other.system = system
+        if self._packed is not None:
+            other._packed = self._packed.with_weights(system)
         return other
 
     def band(self) -> torch.Tensor:
@@ -136,6 +144,20 @@ class Factor:
         draw = self._algebra.solve(self.band, self.reach, white, lower=False, upper=True)
         return draw.view(len(self.ordering.nodes), -1) / precision**0.5
 
+    @property
+    def size(self) -> int:
+        """Rows of the blocks that :meth:`block` cuts the factor into, which couple with their neighbours alone."""
+        return self.band.shape[1]
+
+    @property
+    def blocks(self) -> int:
+        """How many blocks its diagonal has."""
+        return -(-len(self.band) // self.size)
+
+    def block(self, row: int, column: int) -> torch.Tensor:
+        """Block of the factor on the diagonal, or just below it."""
+        return dense_block(self.band, row * self.size, column * self.size)
+
     def diagonal(self) -> torch.Tensor:
         """(unknowns,) squares of the factor's diagonal: conditional precisions, a guess of the matrix's."""
         return self.band[:, 0].double().square()
@@ -149,6 +171,7 @@ def solve_direct(
     system: System | PreparedSystem,
     *,
     factor: Factor | None = None,
+    start: torch.Tensor | None = None,
     tolerance: float = 1e-6,
     refinements: int = 3,
     single: bool = False,
@@ -157,9 +180,9 @@ def solve_direct(
     """Solve by Cholesky and refine until the true relative gradient is below ``tolerance``.
 
     ``Solution.x`` is (nodes * C,) over all coefficients of the knot grid. A given ``factor`` (of the same
-    rows, or of similar ones) is used instead of a new one. ``single`` tries a float32 factor, refined in
-    float64 on the rows, and goes on to a float64 one where that breaks down or stalls. Raises NotConverged
-    unless ``strict`` is False.
+    rows, or of similar ones) is used instead of a new one. ``start`` (active, C): a first solution in solve order,
+    in place of the factor's. ``single`` tries a float32 factor, refined in float64 on the rows, and goes on to a
+    float64 one where that breaks down or stalls. Raises NotConverged unless ``strict`` is False.
     """
     prepared = system if isinstance(system, PreparedSystem) else PreparedSystem(system)
     right = prepared.gradient()
@@ -168,7 +191,7 @@ def solve_direct(
         if found is not None:
             return found
     factor = prepared.factor() if factor is None else factor
-    solution = _refine(prepared, factor, right, tolerance, refinements)
+    solution = _refine(prepared, factor, right, tolerance, refinements, start)
     if solution.gradient > tolerance and strict:
         raise NotConverged(
             f"direct solve: true relative gradient {solution.gradient:.2e} after {solution.iterations - 1} "
@@ -192,14 +215,19 @@ def _solve_single(
 
 
 def _refine(
-    prepared: PreparedSystem, factor: Factor, right: torch.Tensor, tolerance: float, refinements: int
+    prepared: PreparedSystem,
+    factor: Factor,
+    right: torch.Tensor,
+    tolerance: float,
+    refinements: int,
+    start: torch.Tensor | None = None,
 ) -> Solution:
     """Solve and refine until the gradient, recomputed on the rows, is small or no longer halves."""
     scale = float(right.norm())
     if scale == 0:
         x = prepared.expand(torch.zeros_like(right)).flatten()
         return Solution(x, 0.0, 0, "zero right-hand side", "direct")
-    x, best, least = factor.solve(right), None, float("inf")
+    x, best, least = factor.solve(right) if start is None else start, None, float("inf")
     for count in range(1, refinements + 2):
         gradient = prepared.gradient(x)
         relative, before = float(gradient.norm()) / scale, least

@@ -45,7 +45,7 @@ def _evaluate(
     one = torch.ones(search.components, dtype=torch.float64)
     scale = search.scale(one)
     slip = 0.0 if search.slip is None or no_slip is None else scale * no_slip**2
-    prior, right = search.prior(Precisions(one, scale * curvature**4, slip, 0.0))
+    prior, right = search.prior(Precisions(one, search.roughness(scale, curvature), slip, 0.0))
     posterior = Factor(prior + widen(search.data.band, one), search.ordering)
     x = posterior.solve(right + search.data.right)
     used = float((search.data_probes * posterior.solve(search.data_probes)).sum()) / PROBES

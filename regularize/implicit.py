@@ -32,7 +32,7 @@ class _ImplicitSolve(torch.autograd.Function):
         return by_weight.view(weight.shape).to(weight), by_target.to(target), None, None, None, None
 
 
-def solve_with_gradient(system: System, tolerance: float) -> tuple[Solution, Factor]:
+def solve_with_gradient(system: System, tolerance: float, strict: bool = True) -> tuple[Solution, Factor]:
     """As :func:`regularize.solve_direct`, keeping the graph to the first block's weights and targets.
 
     The first block must be VectorRows (full-vector samples); the other blocks are constants.
@@ -40,6 +40,6 @@ def solve_with_gradient(system: System, tolerance: float) -> tuple[Solution, Fac
     block: VectorRows = system.blocks[0]
     still = System(system.knots, system.components, [block.detached(), *system.blocks[1:]], system.damping)
     prepared = PreparedSystem(still)
-    solution, factor = solve_direct(prepared, tolerance=tolerance)
+    solution, factor = solve_direct(prepared, tolerance=tolerance, strict=strict)
     x = _ImplicitSolve.apply(block.weight, block.target, still.blocks[0], solution, factor, prepared)
     return Solution(x, solution.gradient, solution.iterations, solution.reason, solution.solver), factor

@@ -59,6 +59,7 @@ class Choice:
 class Groups:
     """Rows on the search grid. Penalties are means over the fluid or the wall, as in the Smoother's cost."""
 
+    order: int  # of the derivatives that the curvature rows hold
     points: torch.Tensor  # (n, D) m
     velocity: torch.Tensor  # (n, C) m/s
     weight: torch.Tensor  # (n,) row weights
@@ -172,7 +173,7 @@ class LikelihoodSearch:
         scale = self.scale(fit)
         slip = 0.0 if self.slip is None or no_slip is None else scale * no_slip**2
         free = 0.0 if self.divergence is None or divergence is None else scale * divergence**2
-        found, settled, count = Precisions(fit, scale * curvature**4, slip, free), False, 0
+        found, settled, count = Precisions(fit, self.roughness(scale, curvature), slip, free), False, 0
         while count < rounds and not settled:
             count += 1
             old, found = found, self._round(found)
@@ -180,7 +181,8 @@ class LikelihoodSearch:
         scale = self.scale(found.fit)
         noise_each = tuple((found.fit**-0.5).tolist())
         no_slip, divergence = ((each / scale) ** 0.5 if each > 0 else None for each in (found.slip, found.divergence))
-        return Choice(noise_each, (found.rough / scale) ** 0.25, no_slip, divergence, self.factor, count, settled)
+        curvature = (found.rough / scale) ** (0.5 / self.groups.order)
+        return Choice(noise_each, curvature, no_slip, divergence, self.factor, count, settled)
 
     def _round(self, now: Precisions) -> Precisions:
         prior, right = self.prior(now)
@@ -188,7 +190,7 @@ class LikelihoodSearch:
         prior = Factor(prior, self.ordering)
         x = posterior.solve(right + now.fit * self.data.right)
         new_fit, scale = self._noise(x, now.fit, posterior), self.scale(now.fit)
-        low, high = (scale * (factor * self.step) ** 4 for factor in (SHARPEST, 1 / SHARPEST))
+        low, high = (self.roughness(scale, factor * self.step) for factor in (SHARPEST, 1 / SHARPEST))
         rough = now.rough * self._step(prior, posterior, self.rough_probes, self.curvature.energy(x))
         rough, slip, free = min(max(rough, low), high), now.slip, now.divergence
         if slip > 0:
@@ -238,6 +240,10 @@ class LikelihoodSearch:
         """Precision of the whole data set: what turns the Smoother's cost into a log-likelihood."""
         return float(fit.mean() * (self.groups.weight.double().square() * self.factor).sum())
 
+    def roughness(self, scale: float, curvature: float) -> float:
+        """Precision of the curvature rows for a curvature length in m."""
+        return scale * curvature ** (2 * self.groups.order)
+
     def reweigh(self, x: torch.Tensor) -> None:
         """Judge the samples anew by their distance from the fit with coefficients x (active, C)."""
         fitted = self.fit.matvec(self.ordering.expand(x)).view(-1, self.components)
@@ -250,7 +256,7 @@ class LikelihoodSearch:
         weight = self.groups.weight * factor.sqrt()
         rows = VectorRows(self.fit.knots, self.groups.points, self.groups.velocity, weight[:, None])
         self.data = _Alike(rows, self.ordering)
-        ridge = (RIDGE * self.step) ** 4 * float(weight.double().square().sum())
+        ridge = self.roughness(float(weight.double().square().sum()), RIDGE * self.step)
         factor = Factor(self.data.band + ridge * self.curvature.band, self.ordering)
         self.unpenalised = factor.solve(self.data.right[:, None]).squeeze(1)
         # rank = tr((S + R)^-1 S) = unknowns - tr((S + R)^-1 R) for the ridge R

@@ -6,6 +6,7 @@ loaded at first use. ``available()`` says whether there is one, ``require()`` wh
 
 import ctypes
 import os
+from copy import copy
 from functools import lru_cache
 from pathlib import Path
 
@@ -13,6 +14,7 @@ import torch
 
 from .assembly import cell_gram, empty_band
 from .bspline import pieces
+from .errors import InvalidInput
 from .operators import CellRows, DirectionRows, DivergenceRows, RowBlock, System, VectorRows
 from .ordering import Ordering
 
@@ -59,8 +61,8 @@ def library() -> ctypes.CDLL | None:
         level = LEVELS[ctypes.CDLL(str(portable)).spline_cpu_level()]
     chosen = folder / f"_native_{level}.so"
     lib = ctypes.CDLL(str(chosen if chosen.exists() else portable))
-    for name in ("spline_gram", "spline_gradient", "spline_set_threads", "spline_solve_f64", "spline_solve_f32"):
-        getattr(lib, name).restype = None
+    for name in ("gram", "gradient", "sort", "set_threads", "solve_f64", "solve_f32"):
+        getattr(lib, f"spline_{name}").restype = None
     return lib
 
 
@@ -103,7 +105,7 @@ class PackedSystem:
 
     def __init__(self, system: System, ordering: Ordering) -> None:
         self.system, self.ordering, self.lib = system, ordering, library()
-        self._keep: list[torch.Tensor] = []
+        self._keep: list[object] = []
         knots, tile = ordering.knots, self.lib.spline_tile_width()
         place = [ordering.axes.index(k) for k in range(system.components)]
         self.grid = _Grid(
@@ -113,7 +115,7 @@ class PackedSystem:
             padded=-(-knots.local_size // tile) * tile,
             axis_of_component=(ctypes.c_int32 * 4)(*place),
             spacing=(ctypes.c_double * 4)(*[knots.spacing[k] for k in ordering.axes]),
-            pieces=(ctypes.c_double * 36)(*pieces(knots.degree).flatten()),
+            pieces=(ctypes.c_double * 36)(*pieces(knots.degree).T.flatten()),
             cells=len(ordering.keys),
             nodes=len(ordering.nodes),
             position=self._pointer(ordering.position.int()),
@@ -121,6 +123,19 @@ class PackedSystem:
         self.lib.spline_set_threads(torch.get_num_threads())
         self.sorted: list[torch.Tensor] = []
         self.rows = [self._pack(block) for block in system.blocks]
+
+    def with_weights(self, system: System) -> "PackedSystem":
+        """The blocks of ``system``, of which those at the same points need no new sorting."""
+        other = copy(self)
+        other.system, other._keep = system, [self]  # which holds the memory that stays in use
+        pairs = list(zip(system.blocks, self.system.blocks, strict=True))
+        if any(new is not old and (isinstance(new, CellRows) or new.cell is not old.cell) for new, old in pairs):
+            raise InvalidInput("the systems differ in more than the weights and values of rows at the same points")
+        other.rows = [
+            rows if new is old else other._reweighed(new, rows, index)
+            for (new, old), rows, index in zip(pairs, self.rows, self.sorted, strict=True)
+        ]
+        return other
 
     def band(self) -> torch.Tensor:
         """As :func:`regularize.assembly.reference_band`."""
@@ -164,12 +179,19 @@ class PackedSystem:
         out.index_add_(0, near.flatten(), pulled.view(-1, block.components), alpha=-1.0)
 
     def _pack(self, block: RowBlock) -> _Rows:
-        slot = self.ordering.slots(block.cell)
-        index = torch.argsort(slot, stable=True)
-        start = torch.searchsorted(slot[index], torch.arange(len(self.ordering.keys) + 1))
+        slot, cells = self.ordering.slots(block.cell).contiguous(), len(self.ordering.keys)
+        index, start = torch.empty_like(slot), torch.empty(cells + 1, dtype=torch.int64)
+        sizes = ctypes.c_int64(len(slot)), ctypes.c_int64(cells)
+        self.lib.spline_sort(_address(slot), *sizes, _address(index), _address(start))
         self.sorted.append(slot if isinstance(block, CellRows) else index)
         if isinstance(block, CellRows):
             return self._pack_cells(block, start)
+        t = block.t[:, list(self.ordering.axes)][index].double()
+        same = _Rows(kind=KINDS[type(block)], count=len(block), start=self._pointer(start), t=self._pointer(t))
+        return self._reweighed(block, same, index)
+
+    def _reweighed(self, block: RowBlock, same: _Rows, index: torch.Tensor) -> _Rows:
+        """``same`` rows, sorted by ``index``, with the weights and directions of ``block``."""
         weight = block.weight[index].double()
         shared = False
         if isinstance(block, VectorRows):
@@ -178,14 +200,8 @@ class PackedSystem:
             coefficient = weight[:, None] * block.direction[index].double()
         else:
             coefficient = weight[:, None].repeat(1, block.components)
-        return _Rows(
-            kind=KINDS[type(block)],
-            shared=shared,
-            count=len(block),
-            start=self._pointer(start),
-            t=self._pointer(block.t[index][:, list(self.ordering.axes)].double()),
-            coefficient=self._pointer(coefficient),
-        )
+        held = self._pointer(coefficient)
+        return _Rows(same.kind, shared, same.count, same.start, same.t, held)
 
     def _pack_cells(self, block: CellRows, start: torch.Tensor) -> _Rows:
         local = self.ordering.local()

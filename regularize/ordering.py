@@ -1,6 +1,7 @@
 """Numbering of the coefficients that rows touch, longest axis slowest: a banded normal matrix."""
 
 from dataclasses import dataclass
+from math import prod
 
 import torch
 
@@ -15,6 +16,7 @@ class Ordering:
     knots: Knots
     axes: tuple[int, ...]  # point axes (x = 0), slowest in solve order first
     keys: torch.Tensor  # (cells,) sorted solve-order numbers of the cells that hold rows
+    places: torch.Tensor  # (all cells of the grid,) place of each solve-order number in ``keys``
     nodes: torch.Tensor  # (active,) flat coefficient numbers in solve order
     position: torch.Tensor  # (cells, L) solve positions of each cell's coefficients, rising along L
     half_bandwidth: int  # in coefficients: largest position difference within a cell
@@ -28,7 +30,7 @@ class Ordering:
 
     def slots(self, cell: torch.Tensor) -> torch.Tensor:
         """Place (n,) of cells (n, A) in ``keys``; they must be among them."""
-        return torch.searchsorted(self.keys, self.key(cell))
+        return self.places[self.key(cell)]
 
     def expand(self, x: torch.Tensor) -> torch.Tensor:
         """(active, ...) in solve order -> (nodes, ...) with zeros at untouched coefficients."""
@@ -68,8 +70,10 @@ def order(system: System) -> Ordering:
     # the sort is stable, so that a cube keeps the array order: last axis slowest, x fastest
     axes = tuple(sorted(reversed(range(knots.axes)), key=lambda k: -knots.cells[k]))
     cell = torch.cat([block.cell for block in system.blocks])
-    blank = Ordering(knots, axes, *[torch.empty(0)] * 3, 0)
-    keys = torch.unique(blank.key(cell))
+    blank = Ordering(knots, axes, *[torch.empty(0)] * 4, 0)
+    held = torch.zeros(prod(knots.cells), dtype=torch.bool, device=cell.device)
+    held[blank.key(cell)] = True  # a table instead of sorting the rows
+    keys, places = held.nonzero().flatten(), held.cumsum(0) - 1
     number, columns = keys, {}
     for axis in reversed(axes):
         columns[axis] = number % knots.cells[axis]
@@ -85,4 +89,4 @@ def order(system: System) -> Ordering:
     place[nodes] = torch.arange(len(nodes), device=keys.device)
     position = place[touched]
     half = int((position[:, -1] - position[:, 0]).max())
-    return Ordering(knots, axes, keys, nodes, position, half)
+    return Ordering(knots, axes, keys, places, nodes, position, half)

@@ -18,15 +18,15 @@ class NeighbourPreconditioner:
     def __init__(self, prepared: PreparedSystem, factor: Factor) -> None:
         old, new = factor.ordering, prepared.ordering
         self.factor = factor
-        place = torch.full((new.knots.nodes,), -1, dtype=torch.int64)
-        place[old.nodes] = torch.arange(len(old.nodes))
+        place = torch.full((new.knots.nodes,), -1, dtype=torch.int64, device=old.nodes.device)
+        place[old.nodes] = torch.arange(len(old.nodes), device=old.nodes.device)
         self.old_place = place[new.nodes]
         self.known = self.old_place >= 0
         # rows of unit size make a fair guess of the diagonal where the neighbour knows nothing
         self.other = float(factor.diagonal().median())
 
     def __call__(self, r: torch.Tensor) -> torch.Tensor:
-        inner = torch.zeros(len(self.factor.ordering.nodes), r.shape[1], dtype=r.dtype)
+        inner = torch.zeros(len(self.factor.ordering.nodes), r.shape[1], dtype=r.dtype, device=r.device)
         inner[self.old_place[self.known]] = r[self.known]
         out = r / self.other
         out[self.known] = self.factor.solve(inner)[self.old_place[self.known]]

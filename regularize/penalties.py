@@ -6,6 +6,7 @@ limit on fine knots). All derivatives are per metre and the integrals in m^A.
 """
 
 from collections.abc import Sequence
+from itertools import product
 
 import numpy as np
 import torch
@@ -25,15 +26,18 @@ def product_gram(knots: Knots, first: Sequence[int], second: Sequence[int]) -> n
     return gram
 
 
-def curvature_gram(knots: Knots, axes: Sequence[int]) -> np.ndarray:
-    """(L, L): integral of the squared second derivatives |grad grad f|^2 over the listed axes."""
-    if knots.degree < 2:
-        raise InvalidInput("curvature needs degree >= 2: a linear spline has no second derivative")
+def curvature_gram(knots: Knots, axes: Sequence[int], order: int = 2) -> np.ndarray:
+    """(L, L): integral of the squared derivatives of an order, for 2 |grad grad f|^2, over the listed axes.
+
+    All derivatives are summed, mixed ones as often as they occur: the integral is that of the isotropic semi-norm of
+    thin-plate splines (J. Duchon, 1977). InvalidInput where the spline's own derivative of that order vanishes.
+    """
+    if knots.degree < order:
+        raise InvalidInput(f"derivatives of order {order} need degree >= {order}, not {knots.degree}")
     total = np.zeros((knots.local_size,) * 2)
-    for i in axes:
-        for j in axes:
-            orders = [int(a == i) + int(a == j) for a in range(knots.axes)]
-            total += product_gram(knots, orders, orders)
+    for along in product(axes, repeat=order):
+        orders = [along.count(a) for a in range(knots.axes)]
+        total += product_gram(knots, orders, orders)
     return total
 
 

@@ -7,9 +7,9 @@ K. Takahashi et al. (1973; see H. Rue and L. Held, Gaussian Markov Random Fields
 as wide as the band.
 """
 
-import numpy as np
 import torch
 
+from .block import BlockFactor
 from .direct import Factor
 from .knots import Knots
 
@@ -17,9 +17,9 @@ from .knots import Knots
 class Posterior:
     """Variances of the field; ``precision`` turns the normal matrix into that of a log-posterior."""
 
-    def __init__(self, factor: Factor, precision: float, components: int) -> None:
+    def __init__(self, factor: Factor | BlockFactor, precision: float, components: int) -> None:
         self.ordering, self.components, self.precision = factor.ordering, components, precision
-        self._band = factor.band.numpy()
+        self._factor = factor
         self._blocks: list[tuple[torch.Tensor, torch.Tensor | None]] | None = None
 
     def variance(self, points: torch.Tensor) -> torch.Tensor:
@@ -28,7 +28,7 @@ class Posterior:
         cell, t = knots.locate(points.double())
         slot = self.ordering.slots(cell)
         basis = knots.stencil(t)[:, self.ordering.local()]
-        out = torch.empty(len(points), self.components, dtype=torch.float64)
+        out = torch.empty(len(points), self.components, dtype=torch.float64, device=points.device)
         for number in torch.unique(slot):
             here = slot == number
             covariance = self._cell_covariance(self.ordering.position[number])
@@ -39,8 +39,8 @@ class Posterior:
         """(C, L, L) covariance of each component's coefficients in one cell, times the precision."""
         if self._blocks is None:
             self._blocks = self._invert()
-        size = self._band.shape[1]
-        unknown = position * self.components + torch.arange(self.components)[:, None]
+        size = self._factor.size
+        unknown = position * self.components + torch.arange(self.components, device=position.device)[:, None]
         first = int(unknown.min()) // size
         diagonal, below = self._blocks[first]
         local = unknown - first * size
@@ -51,32 +51,19 @@ class Posterior:
 
     def _invert(self) -> list[tuple[torch.Tensor, torch.Tensor | None]]:
         """Blocks (k, k) and (k + 1, k) of the inverse, each as wide as the band."""
-        size = self._band.shape[1]
-        starts = list(range(0, len(self._band), size))
         done: list[tuple[torch.Tensor, torch.Tensor | None]] = []
         following: torch.Tensor | None = None
-        for start in reversed(starts):
-            lower = self._dense(start, start, size)
-            eye = torch.eye(len(lower), dtype=torch.float64)
+        for k in reversed(range(self._factor.blocks)):
+            lower = self._factor.block(k, k)
+            eye = torch.eye(len(lower), dtype=torch.float64, device=lower.device)
             inverse = torch.linalg.solve_triangular(lower, eye, upper=False)
             if following is None:
                 diagonal, below = inverse.T @ inverse, None
             else:
                 # Z_kk = L_kk^-T (I + B' Z B) L_kk^-1 and Z_k+1,k = -Z B L_kk^-1 with B = L_k+1,k
-                coupling = self._dense(start + size, start, size) @ inverse
+                coupling = self._factor.block(k + 1, k) @ inverse
                 below = -(following @ coupling)
                 diagonal = inverse.T @ inverse - coupling.T @ below
             done.append((diagonal, below))
             following = diagonal
         return done[::-1]
-
-    def _dense(self, row: int, column: int, size: int) -> torch.Tensor:
-        """Dense block (rows row.., columns column.., at most ``size`` each) of the factor."""
-        count, width = self._band.shape
-        rows, columns = min(size, count - row), min(size, count - column)
-        i = np.arange(row, row + rows)[:, None]
-        offset = i - np.arange(column, column + columns)
-        inside = (offset >= 0) & (offset < width)
-        block = np.zeros((rows, columns))
-        block[inside] = self._band[(i - offset)[inside], offset[inside]]
-        return torch.from_numpy(block)

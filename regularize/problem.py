@@ -5,6 +5,7 @@ from math import prod
 
 import torch
 
+from .block import BlockFactor
 from .direct import Factor, PreparedSystem, solve_direct
 from .field import SplineField
 from .krylov import Solution
@@ -22,14 +23,16 @@ class Problem:
     system: System
     choice: Choice | None
 
-    def field(self, solution: Solution, factor: Factor | None = None, own_factor: bool = True) -> SplineField:
+    def field(
+        self, solution: Solution, factor: Factor | BlockFactor | None = None, own_factor: bool = True
+    ) -> SplineField:
         """The field of a solution; the factor of ``system`` itself also gives its uncertainty."""
         knots, data = self.system.knots, self.data
         coefficients = solution.x.to(data.dtype).view(knots.nodes, -1).T.reshape(-1, *knots.shape)
         covered = torch.zeros(prod(knots.cells), dtype=torch.bool, device=coefficients.device)
         covered[self.system.cells()] = True
         posterior = None
-        if isinstance(factor, Factor) and own_factor:  # on a GPU there is no selected inverse yet
+        if factor is not None and own_factor:
             posterior = Posterior(factor, self.precision(solution), self.system.components)
         return SplineField(
             knots, coefficients, covered, solution, data.left_out, self.choice, posterior, factor
@@ -49,16 +52,18 @@ class Problem:
         variance = residual.square().sum() / fit.weight.double().square().sum()
         return float(scale / variance.clamp(min=1e-300))
 
-    def solve_all(self, velocities: list[torch.Tensor], tolerance: float) -> list[SplineField]:
+    def solve_all(self, velocities: list[torch.Tensor], tolerance: float, strict: bool) -> list[SplineField]:
         """Fields of several sample sets (n, C) at the same points and weights: one factorisation."""
         prepared = PreparedSystem(self.system)
-        factor = prepared.factor()
-        fields = []
+        factor, fields, members = prepared.factor(), [], []
         for velocity in velocities:
             fit = self.system.blocks[0].with_target(velocity)
-            system = System(
-                self.system.knots, self.system.components, [fit, *self.system.blocks[1:]], self.system.damping
-            )
-            solution, _ = solve_direct(prepared.with_targets(system), factor=factor, tolerance=tolerance)
-            fields.append(replace(self, system=system).field(solution))
+            knots, components, damping = self.system.knots, self.system.components, self.system.damping
+            system = System(knots, components, [fit, *self.system.blocks[1:]], damping)
+            members.append(prepared.with_targets(system))
+        # one pass over the factor for all of them: each alone would fetch the whole of it from memory
+        starts = factor.solve(torch.stack([member.gradient() for member in members], dim=-1)).unbind(-1)
+        for member, start in zip(members, starts, strict=True):
+            solution, _ = solve_direct(member, factor=factor, start=start, tolerance=tolerance, strict=strict)
+            fields.append(replace(self, system=member.system).field(solution))
         return fields

@@ -107,18 +107,18 @@ def penalty_blocks(
         factor = row_factor(divergence_gram(knots, components), components).to(data.points)
         blocks.append(CellRows(knots, cells, options.divergence / extent**0.5 * factor, components))
     if options.curvature:
-        gram = options.curvature**4 * smoothness_gram(options, knots, data)
+        gram = options.curvature ** (2 * options.order) * smoothness_gram(options, knots, data)
         factor = row_factor(gram).to(data.points) / extent**0.5
         blocks.append(CellRows(knots, cells, factor, components))
     return blocks, cells, (options.damping or 0.0) * (prod(knots.spacing) / extent) ** 0.5
 
 
 def smoothness_gram(options: "Smoother", knots: Knots, data: FitData) -> np.ndarray:
-    """(L, L) cell integral of |grad grad v|^2, plus (time_curvature / curvature)^4 |d^2 v / dt^2|^2."""
-    gram = curvature_gram(knots, range(data.components))
+    """(L, L) cell integral of |grad^m v|^2, plus (time_curvature / curvature)^2m |d^m v / dt^m|^2, m the order."""
+    gram = curvature_gram(knots, range(data.components), options.order)
     if data.over_time and options.time_curvature:
         ratio = options.time_curvature / options.curvature
-        gram = gram + ratio**4 * curvature_gram(knots, [data.components])
+        gram = gram + ratio ** (2 * options.order) * curvature_gram(knots, [data.components], options.order)
     return gram
 
 

@@ -3,11 +3,12 @@
 The cost (options in physical units, ``scaling="density"``) is a sum of averages,
 
     J(v) = <|v - v_i|^2>_samples + divergence^2 <(div v)^2>_fluid + wall^2 <(n.(v - v_w))^2>_walls
-           + no_slip^2 <|v - v_w|^2>_walls + curvature^4 <|grad grad v|^2>_fluid + damping^2 <|v|^2>_fluid,
+           + no_slip^2 <|v - v_w|^2>_walls + curvature^4 <|grad grad v|^2>_fluid + damping^2 <|v|^2>_fluid
 
-so that no number changes its meaning with the grid, the number of samples or the size of the box: wall,
-no_slip and damping are ratios, divergence and curvature lengths (curvature halves wavelengths of
-2 pi curvature). Averages over samples are weighted by weight^(2 power), ones over walls by WallRows.weight.
+(with ``order`` m other than 2, curvature^2m and the m-th derivatives), so that no number changes its meaning with
+the grid, the number of samples or the size of the box: wall, no_slip and damping are ratios, divergence and curvature
+lengths (curvature halves wavelengths of 2 pi curvature). Averages over samples are weighted by weight^(2 power), ones
+over walls by WallRows.weight.
 ``scaling="thesis"`` is eq. 3.22 with sums, derivatives per mean knot spacing and divergence rows at the
 samples (ERRATA 3.17, 3.23), the meaning that table 4.1 needs.
 """
@@ -26,6 +27,7 @@ from .knots import Knots
 from .krylov import Solution, lsqr
 from .likelihood import Choice
 from .lsmr import lsmr
+from .memory import band_bytes, device_memory
 from .operators import System
 from .pcg import pcg
 from .problem import Problem
@@ -50,19 +52,21 @@ class Smoother:
     ``knots``: knot distance in m (or one per axis); ``nodes`` instead fixes the coefficients per axis,
     longest side first (table 4.1: 32, 16, 16). ``time_knots`` (s): knot distance along the time, for points
     with a time column; ``time_curvature`` (s) adds time_curvature^4 <|d^2 v / dt^2|^2> to the cost and keeps
-    its ratio to curvature where that is chosen automatically. ``power``: samples' rows are multiplied by
-    weight ** power. ``automatic="likelihood"`` chooses curvature, no_slip and the noise of each velocity
-    component from the data (see ``likelihood``), "gcv" curvature alone, believing all samples independent
-    (see ``gcv``); the values given here are then the first guess, and are kept where fewer than 30 samples,
-    or samples of no flow, leave nothing to choose from (``field.choice`` is None there). ``robust``: "tukey"
+    its ratio to curvature where that is chosen automatically. ``order``: of the derivatives that curvature (and
+    time_curvature) penalises, at most ``degree``; 3 fills gaps in exact, smooth data better. ``power``: samples'
+    rows are multiplied by weight ** power. ``automatic="likelihood"`` chooses curvature, no_slip and the noise of
+    each velocity component from the data (see ``likelihood``), "gcv" curvature alone, believing all samples
+    independent (see ``gcv``); the values given here are then the first guess, and are kept where fewer than 30
+    samples, or samples of no flow, leave nothing to choose from (``field.choice`` is None there). ``robust``: "tukey"
     or "huber" reweighting of outliers, found together with that choice. ``choose_divergence``: the likelihood
-    chooses divergence too. Only for samples of independent errors: the likelihood takes the divergence of
-    errors that are correlated over millimetres (speckle tracking) for flow, and settles on too weak a penalty.
+    chooses divergence too. Only for samples of independent errors: the likelihood takes the divergence of errors that
+    are correlated over millimetres (speckle tracking) for flow, and settles on too weak a penalty.
     ``search_knots``: the choice is made on a grid this many times coarser, in at most ``rounds`` rounds.
-    ``solver``: "direct" (what "auto" picks), "direct32" (a float32 factor, refined to the tolerance: half the
-    time on large grids), "lsqr", "lsmr", or "pcg" with a neighbouring frame's factor;
-    ``sparse``: the iterative ones store the matrix and its transpose instead of applying rows.
-    ``tolerance``: true relative gradient at which a solver may stop; NotConverged otherwise.
+    ``solver``: "direct", "direct32" (a float32 factor, refined to the tolerance: half the time on large grids),
+    "lsqr", "lsmr", or "pcg" with a neighbouring frame's factor; "auto" is direct, or LSMR where the factor would fill
+    more than half of the device's memory. ``sparse``: the iterative ones store the matrix and its transpose instead
+    of applying rows. ``tolerance``: true relative gradient at which a solver may stop. ``strict``: NotConverged
+    where it cannot be reached; else the field comes as it is, and ``field.solution`` says how far that is.
     """
 
     knots: float | tuple[float, ...] | None = 3e-3
@@ -74,6 +78,7 @@ class Smoother:
     no_slip: float | None = 0.5
     curvature: float | None = 1e-3
     time_curvature: float | None = 10e-3
+    order: int = 2
     damping: float | None = 1e-5
     power: float = 1.0
     automatic: str | None = "likelihood"
@@ -86,6 +91,7 @@ class Smoother:
     sparse: bool = False
     tolerance: float = 1e-6
     max_iterations: int = 5000
+    strict: bool = True
 
     def __post_init__(self) -> None:
         if (self.knots is None) == (self.nodes is None):
@@ -96,6 +102,8 @@ class Smoother:
             value = getattr(self, name)
             if value is not None and not 0 <= value < float("inf"):
                 raise InvalidInput(f"{name} is {value}: it must be finite and >= 0, or None to switch it off")
+        if not 1 <= self.order <= self.degree and self.curvature:
+            raise InvalidInput(f"order is {self.order}: it must lie between 1 and degree = {self.degree}")
         if self.power < 0:
             raise InvalidInput(f"power is {self.power}: it must be >= 0")
         for name, known in (
@@ -185,13 +193,14 @@ class Smoother:
         if self.solver == "pcg" and neighbour is not None:
             solution, factor = self._with_neighbour(problem.system, neighbour)
             return problem.field(solution, factor, own_factor=False)
-        if self.solver in WITHOUT_FACTOR:
+        solver = self._solver(problem.system, needs_factor=uncertainty or traced)
+        if solver in WITHOUT_FACTOR:
             if uncertainty:
-                raise InvalidInput(f"solver {self.solver!r} keeps no factor for uncertainty: use 'direct'")
-            return problem.field(self._without_factor(problem.system))
+                raise InvalidInput(f"solver {solver!r} keeps no factor for uncertainty: use 'direct'")
+            return problem.field(self._without_factor(problem.system, solver))
         solve = solve_with_gradient if traced else solve_direct
-        solution, factor = solve(problem.system, tolerance=self.tolerance)
-        return problem.field(solution, factor if uncertainty or self.solver == "pcg" else None)
+        solution, factor = solve(problem.system, tolerance=self.tolerance, strict=self.strict)
+        return problem.field(solution, factor if uncertainty or solver == "pcg" else None)
 
     def fit_many(
         self,
@@ -214,7 +223,7 @@ class Smoother:
         where = (divergence_points, box, self.power)
         every = [FitData.checked(points, v, weight, wall, *where) for v in velocities]
         problem = self._problem(replace(every[0], velocity=torch.stack([d.velocity for d in every]).mean(0)))
-        return problem.solve_all([data.velocity for data in every], self.tolerance)
+        return problem.solve_all([data.velocity for data in every], self.tolerance, self.strict)
 
     def _problem(self, data: FitData) -> Problem:
         knots = knots_for(data, self)
@@ -245,12 +254,20 @@ class Smoother:
         data = data.reweighed(choice)
         return Problem(data, build_system(options, knots, data), choice)
 
-    def _without_factor(self, system: System) -> Solution:
-        if self.solver == "direct32":
-            return solve_direct(system, tolerance=self.tolerance, single=True)[0]
-        method = lsqr if self.solver == "lsqr" else lsmr
+    def _solver(self, system: System, needs_factor: bool) -> str:
+        """The solver by name, chosen by size and memory where the option leaves it open."""
+        if self.solver != "auto":
+            return self.solver
+        device = system.blocks[0].target.device
+        return "direct" if needs_factor or band_bytes(system) <= 0.5 * device_memory(device) else "lsmr"
+
+    def _without_factor(self, system: System, solver: str) -> Solution:
+        options = {"tolerance": self.tolerance, "strict": self.strict}
+        if solver == "direct32":
+            return solve_direct(system, single=True, **options)[0]
+        method = lsqr if solver == "lsqr" else lsmr
         apply = sparse_operators(system) if self.sparse else (system.matvec, system.rmatvec)
-        options = {"tolerance": self.tolerance, "max_iterations": self.max_iterations}
+        options["max_iterations"] = self.max_iterations
         return method(*apply, system.target(), damping=system.damping, **options)
 
     def _with_neighbour(self, system: System, neighbour: SplineField) -> tuple[Solution, Factor]:
@@ -264,4 +281,4 @@ class Smoother:
         if solution.gradient <= self.tolerance:
             return solution, neighbour.factor
         # a neighbour too different costs more iterations than a factorisation of its own
-        return solve_direct(prepared, tolerance=self.tolerance)
+        return solve_direct(prepared, tolerance=self.tolerance, strict=self.strict)

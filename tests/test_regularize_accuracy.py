@@ -21,12 +21,12 @@ def flow(points, waves):
     return torch.stack([torch.sin(y) + torch.cos(z), torch.sin(z) - torch.cos(x), torch.cos(x + y)], dim=1)
 
 
-def errors(samples, grids, scale, waves):
+def errors(samples, grids, scale, waves, light=LIGHT):
     generator = torch.Generator().manual_seed(0)
     points, test = inside(samples, scale * AXES, generator), 0.97 * inside(3000, scale * AXES, generator)
     wanted = torch.cat([inside(2 * samples, scale * AXES, generator), test])
     for nodes in grids:
-        fitted = LIGHT.fixed(knots=None, nodes=nodes).fit(points, flow(points, waves), divergence_points=wanted)
+        fitted = light.fixed(knots=None, nodes=nodes).fit(points, flow(points, waves), divergence_points=wanted)
         yield float((fitted(test, outside=0.0) - flow(test, waves)).norm() / flow(test, waves).norm())
 
 
@@ -39,6 +39,15 @@ def test_with_fewer_samples_than_coefficients_their_density_sets_the_error():
     """Not a floor of the method: more samples on the same fine grid lower it."""
     few, many = (next(errors(samples, ((20, 11, 11),), 0.5, 8.0)) for samples in (500, 8000))
     assert many < 0.1 * few
+
+
+def test_third_derivatives_fill_the_gaps_between_few_samples():
+    """With as few samples as cells, where least second derivatives let the error rise again from grid to grid."""
+    grids = ((12, 8, 8), (18, 10, 10), (24, 13, 13))
+    third = list(errors(850, grids, 0.35, 6.0, LIGHT.fixed(order=3, curvature=1e-4)))
+    second = list(errors(850, grids[1:], 0.35, 6.0))
+    assert third[0] > 1.7 * third[1] > 1.7 * 1.2 * third[2]
+    assert second[1] > 1.5 * second[0] and second[1] > 3 * third[2]
 
 
 @pytest.mark.slow  # 20 s and 2 GB; 64 x 32 x 32 is in examples/benchmarks/spline.py

@@ -95,6 +95,21 @@ def test_direct_and_lsqr_equal_dense_least_squares(axes, degree):
     assert torch.allclose(iterative.x, dense, atol=1e-8)
 
 
+@pytest.mark.parametrize("engine", ENGINES)
+def test_new_weights_at_the_same_points_need_no_new_preparation(engine):
+    knots, blocks = blocks_of(3)
+    prepared = PreparedSystem(System(knots, 3, list(blocks.values()), 0.3), engine=engine)
+    change = torch.rand(len(blocks["vector"]), 1, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    other = System(knots, 3, [blocks["vector"].with_weight(change), *list(blocks.values())[1:]], 0.3)
+    fresh, reweighed = PreparedSystem(other, engine="reference"), prepared.with_weights(other)
+    assert torch.allclose(reweighed.band(), fresh.band(), atol=1e-12)
+    x = torch.ones(len(prepared.ordering.nodes), 3, dtype=torch.float64)
+    assert torch.allclose(reweighed.gradient(x), fresh.gradient(x), atol=1e-9)
+    if engine == "native":
+        with pytest.raises(InvalidInput, match="same points"):
+            prepared.with_weights(System(knots, 3, list(blocks_of(3)[1].values()), 0.3))
+
+
 def test_factor_serves_many_right_hand_sides():
     knots, blocks = blocks_of(2)
     prepared = PreparedSystem(System(knots, 2, list(blocks.values()), 0.3))

@@ -6,7 +6,10 @@ from dataclasses import replace
 import pytest
 import torch
 
-from regularize import InvalidInput, Smoother, WallRows
+from regularize import InvalidInput, NotConverged, PreparedSystem, Smoother, WallRows
+from regularize.memory import band_bytes, device_memory
+from regularize.rows import build_system, knots_for
+from regularize.samples import FitData
 
 GIVEN = {"automatic": None, "robust": None}  # the options as they stand
 PLAIN = {"divergence": None, "wall": None, "no_slip": None, "curvature": None, "damping": 1e-9, **GIVEN}
@@ -190,6 +193,50 @@ def test_solvers_and_precisions_agree():
     assert torch.allclose(single(points).double(), direct, atol=1e-4 * float(direct.abs().max()))
 
 
+def test_the_solver_goes_by_size_and_memory(monkeypatch):
+    points, velocity = cloud(), rotation(cloud())
+    options = Smoother(divergence=3e-3, damping=1e-2, **GIVEN)
+    direct = options.fit(points, velocity)
+    monkeypatch.setattr("regularize.smoother.device_memory", lambda device: 1e6)
+    small = options.fit(points, velocity)
+    assert (direct.solution.solver, small.solution.solver) == ("direct", "lsmr")
+    assert torch.allclose(small(points), direct(points), atol=1e-5)
+    assert options.fit(points, velocity, uncertainty=True).solution.solver == "direct"  # it rests on the factor
+
+
+@pytest.mark.parametrize("axes,degree", [(2, 1), (3, 3)])
+def test_the_memory_of_a_factor_is_foreseen(axes, degree, monkeypatch):
+    points = cloud(axes=axes)
+    options = Smoother(degree=degree, divergence=None, curvature=None, **GIVEN)
+    data = FitData.checked(points, points)
+    system = build_system(options, knots_for(data, options), data)
+    band = PreparedSystem(system).band()
+    bound = band_bytes(system)
+    assert band.nbytes <= bound < 6 * band.nbytes
+    monkeypatch.setattr("regularize.memory.WORTH_COUNTING", 0)
+    assert band_bytes(system) == band.nbytes
+    assert 1e8 < device_memory(torch.device("cpu")) < 1e14
+
+
+def test_a_field_that_is_not_converged_comes_only_when_asked_for():
+    points, velocity = cloud(), rotation(cloud())
+    options = Smoother(solver="lsmr", max_iterations=5, **GIVEN)
+    with pytest.raises(NotConverged):
+        options.fit(points, velocity)
+    field = replace(options, strict=False).fit(points, velocity)
+    assert field.solution.gradient > 1e-6 and "limit" in field.solution.reason and torch.isfinite(field(points)).all()
+
+
+def test_the_order_of_the_penalty_says_which_polynomials_cost_nothing():
+    points = cloud(1500)
+    x, y = 100 * points[:, 0], 100 * points[:, 1]
+    linear, quadratic = torch.stack([y, x, x], dim=1), torch.stack([y**2, x**2, x * y], dim=1)
+    stiff = Smoother(divergence=None, wall=None, no_slip=None, damping=1e-9, **GIVEN)
+    for order, flow, kept in ((2, linear, True), (2, quadratic, False), (3, quadratic, True)):
+        field = replace(stiff, curvature=30e-3, order=order).fit(points, flow)
+        assert torch.allclose(field(points), flow, atol=1e-4) == kept
+
+
 def test_unsupported_points_are_masked():
     points = cloud(axes=2)
     field = Smoother().fit(points, points)
@@ -234,6 +281,7 @@ def test_nan_is_allowed_only_under_zero_weight():
         ({"scaling": "other"}, "scaling"),
         ({"nodes": (8, 8, 8)}, "exactly one"),
         ({"power": -1.0}, "power"),
+        ({"order": 4}, "order"),
         ({"tolerance": 0.0}, "tolerance"),
         ({"automatic": "gcv", "choose_divergence": True}, "choose_divergence"),
         ({"divergence": None, "choose_divergence": True}, "choose_divergence"),

@@ -8,7 +8,8 @@ import torch
 from ultrasound_cases import cube, lattice, packet
 
 from torchsph.ultrasound.acquisition import Acquisition, Beams, Packet
-from torchsph.ultrasound.doppler import ColourDoppler, DopplerOptions, colour_doppler, vector_doppler
+from torchsph.ultrasound.doppler import ColourDoppler, colour_doppler, vector_doppler
+from torchsph.ultrasound.doppler_measurement import DopplerOptions
 
 PLAIN = ColourDoppler(clutter=None)
 
@@ -75,11 +76,11 @@ def test_beams_that_do_not_span_are_refused():
 
 
 def test_steered_beams_lie_at_their_angle_on_both_sides():
-    directions = np.array(DopplerOptions(steering=20.0).directions(3))
+    directions = np.array([beams.direction for beams in DopplerOptions(steering=20.0).beams(3)])
     assert directions.shape == (4, 3)
     np.testing.assert_allclose(directions @ [0, 0, 1], math.cos(math.radians(20)))
     np.testing.assert_allclose(directions.sum(0)[:2], 0, atol=1e-12)
-    assert len(DopplerOptions(steering=20.0).directions(2)) == 2
+    assert len(DopplerOptions(steering=20.0).beams(2)) == 2
 
 
 def test_points_outside_and_single_images_are_refused():

@@ -15,18 +15,21 @@ from torchsph.ultrasound.pointspread import GaussianPointSpread, SampledPointSpr
 GRID = Grid((1e-3, -2e-3, 10e-3), (1 / 6e3,) * 3, (24, 22, 20))
 
 
-def scatterers(count=40, dtype=torch.float64):
+PLANE = Grid((1e-3, 10e-3), (1 / 6e3,) * 2, (24, 40))
+
+
+def scatterers(count=40, dtype=torch.float64, grid=GRID):
     generator = torch.Generator().manual_seed(3)
-    span = torch.tensor([5e-3, 6e-3, 6e-3], dtype=dtype)
-    unit = torch.rand((count, 3), generator=generator, dtype=dtype)
-    points = torch.tensor(GRID.origin, dtype=dtype) - 1e-3 + unit * span
+    span = torch.tensor([5e-3, 6e-3, 6e-3], dtype=dtype)[: grid.dimension]
+    unit = torch.rand((count, grid.dimension), generator=generator, dtype=dtype)
+    points = torch.tensor(grid.origin, dtype=dtype) - 1e-3 + unit * span
     amplitude = torch.randn((count, 2), generator=generator, dtype=dtype)
     return points, torch.view_as_complex(amplitude)
 
 
-def direct(points, amplitude, beams, acquisition, pointspread):
+def direct(points, amplitude, beams, acquisition, pointspread, grid=GRID):
     """sum of a h(x - s) exp(-i 4 pi f depth(s) / c), node by node."""
-    nodes = GRID.nodes()
+    nodes = grid.nodes()
     beam = torch.tensor(beams.direction, dtype=torch.float64)
     offset = nodes[:, None] - points.double()
     along = offset @ beam
@@ -34,16 +37,17 @@ def direct(points, amplitude, beams, acquisition, pointspread):
     axial, lateral = fwhm_to_deviation(pointspread.axial), fwhm_to_deviation(pointspread.lateral)
     envelope = torch.exp(-0.5 * (along / axial) ** 2 - 0.5 * (across / lateral) ** 2)
     phase = torch.exp(-1j * acquisition.phase_per_metre * (points.double() @ beam))
-    return ((amplitude.to(torch.complex128) * phase) * envelope).sum(1).view(GRID.shape)
+    return ((amplitude.to(torch.complex128) * phase) * envelope).sum(1).view(grid.shape)
 
 
-@pytest.mark.parametrize("direction", [(0.0, 0.0, 1.0), (0.3, 0.0, 1.0), (1.0, 2.0, 3.0)])
+@pytest.mark.parametrize("direction", [(0.0, 0.0, 1.0), (0.3, 0.0, 1.0), (1.0, 2.0, 3.0), (0.0, 1.0), (-0.5, 1.0)])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_image_equals_direct_summation(direction, dtype):
     acquisition, beams, pointspread = Acquisition(), Beams(direction), GaussianPointSpread()
-    points, amplitude = scatterers(dtype=dtype)
-    image = ParallelImager(GRID, pointspread, acquisition, beams, dtype=dtype).image(points, amplitude)
-    exact = direct(points, amplitude, beams, acquisition, pointspread)
+    grid = GRID if len(direction) == 3 else PLANE
+    points, amplitude = scatterers(dtype=dtype, grid=grid)
+    image = ParallelImager(grid, pointspread, acquisition, beams, dtype=dtype).image(points, amplitude)
+    exact = direct(points, amplitude, beams, acquisition, pointspread, grid)
     assert image.dtype == dtype.to_complex()
     assert (image - exact).abs().square().mean().sqrt() < 2e-3 * exact.abs().square().mean().sqrt()
 

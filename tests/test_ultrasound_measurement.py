@@ -10,11 +10,12 @@ from test_ultrasound_noise import recording
 
 import geometry
 from torchsph.ultrasound.calibration import fit_calibration
-from torchsph.ultrasound.doppler import DopplerOptions, measure_doppler
+from torchsph.ultrasound.doppler_measurement import DopplerOptions, measure_doppler
 from torchsph.ultrasound.echoes import EchoModel, simulate_packet
+from torchsph.ultrasound.estimates import Estimates
 from torchsph.ultrasound.measurement import ScannerOptions, image_grid
-from torchsph.ultrasound.speckle import SpeckleOptions, measure_speckle
-from torchsph.ultrasound.tracking import Estimates, SpeckleTracker
+from torchsph.ultrasound.speckle_measurement import SpeckleOptions, measure_speckle
+from torchsph.ultrasound.tracking import SpeckleTracker
 from torchsph.ultrasound.training import TrainingPlan, calibrate, random_swirl, training_points
 
 QUICK = SpeckleOptions(every=2, training=2, tissue=20.0, image_spacing=0.25e-3)

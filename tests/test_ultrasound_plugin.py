@@ -9,8 +9,9 @@ import torch
 from ultrasound_cases import STEP, cube, lattice, packet
 
 from torchsph.ultrasound.acquisition import Beams
+from torchsph.ultrasound.estimates import Flag
 from torchsph.ultrasound.plugin import LibraryTracker, Tracker
-from torchsph.ultrasound.tracking import Flag, SpeckleTracker
+from torchsph.ultrasound.tracking import SpeckleTracker
 
 COMPILER = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
 SOURCE = Path(__file__).parent / "tracker.c"

@@ -10,9 +10,10 @@ from ultrasound_cases import STEP, cube, lattice, packet
 from geometry import Grid
 from torchsph.ultrasound.acquisition import Acquisition, Beams, Packet
 from torchsph.ultrasound.clutter import FIRFilter
-from torchsph.ultrasound.correlation import KernelShape, correlate
+from torchsph.ultrasound.correlation import KernelShape, correlate, image_pairs
+from torchsph.ultrasound.estimates import Flag
 from torchsph.ultrasound.peak import find_peak
-from torchsph.ultrasound.tracking import Flag, SpeckleTracker
+from torchsph.ultrasound.tracking import SpeckleTracker
 
 PLAIN = SpeckleTracker(clutter=None)
 
@@ -30,7 +31,7 @@ def test_correlation_equals_its_definition_at_every_lag():
     volume, shape = random_volume(), KernelShape((2, 1, 1), (1, 2, 1))
     corner, offset = torch.tensor([[4, 5, 5], [8, 6, 7]]), torch.tensor([[0, 0, 0], [1, -1, 2]])
     ramp = torch.tensor([[0.3, 0.0, -0.2], [0.0, 0.1, 0.0]], dtype=torch.float64)
-    rho = correlate(volume, corner, offset, 2, shape, ramp=ramp)
+    rho = correlate(image_pairs(volume, 2, shape.half), corner, offset, shape, ramp=ramp)
     for point in range(2):
         z, y, x = corner[point].tolist()
         place = [torch.arange(-h, h + 1, dtype=torch.float64) for h in shape.half]
@@ -48,13 +49,9 @@ def test_correlation_equals_its_definition_at_every_lag():
 
 def test_a_silent_kernel_correlates_with_nothing():
     volume = torch.zeros((20, 18, 16, 3), dtype=torch.complex64)
-    rho = correlate(
-        volume,
-        torch.tensor([[5, 5, 5]]),
-        torch.zeros((1, 3), dtype=torch.long),
-        1,
-        KernelShape((1,) * 3, (1,) * 3),
-    )
+    shape = KernelShape((1,) * 3, (1,) * 3)
+    pairs = image_pairs(volume, 1, shape.half)
+    rho = correlate(pairs, torch.tensor([[5, 5, 5]]), torch.zeros((1, 3), dtype=torch.long), shape)
     assert not rho.abs().any()
 
 

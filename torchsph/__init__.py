@@ -11,6 +11,7 @@ from .incompressible import Projection
 from .observation_error import ObservationError, estimate_error
 from .particle_filter import FilteredRun, filter_sph
 from .pipeline import DEFAULT_METHOD, METHODS, MethodResult, forecast_skill, make_model, run_methods
+from .population import PopulationControl
 from .presets import PRESETS, preset
 from .scene import Fluid, Scene, Valve
 from .schemes import (
@@ -23,7 +24,7 @@ from .schemes import (
     Rollback,
     WeaklyCompressible,
 )
-from .seeding import Seeding
+from .seeding import ResidualMotion, Seeding, residual_motion
 from .simulation import NumericalFailure, Simulation
 from .simulator import Simulator
 from .smooth import smooth
@@ -32,8 +33,9 @@ from .smoothing import KERNELS, SmoothingKernel, kernel
 __all__ = [
     "DEFAULT_METHOD", "KERNELS", "METHODS", "PRESETS", "XSPH", "CompleteKernelWall", "EnsembleOptions",
     "EnsembleRun", "FilteredRun", "Fluid", "ForecastSkill", "GammaRamp", "GridForecast", "MethodResult",
-    "NumericalFailure", "ObservationError", "PotentialWall", "PressureSource", "Projection", "Reservoir",
-    "Rollback", "Scene", "Seeding", "Simulation", "Simulator", "SmoothingKernel", "Transfer", "Valve",
-    "WeaklyCompressible", "__version__", "assimilate", "default_filter", "estimate_error", "filter_sph",
-    "forecast_skill", "kernel", "make_model", "preset", "run_methods", "skill", "smooth",
+    "NumericalFailure", "ObservationError", "PopulationControl", "PotentialWall", "PressureSource", "Projection",
+    "Reservoir", "ResidualMotion", "Rollback", "Scene", "Seeding", "Simulation", "Simulator", "SmoothingKernel",
+    "Transfer", "Valve", "WeaklyCompressible", "__version__", "assimilate", "default_filter", "estimate_error",
+    "filter_sph", "forecast_skill", "kernel", "make_model", "preset", "residual_motion", "run_methods", "skill",
+    "smooth",
 ]  # fmt: skip

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
 
@@ -19,6 +21,7 @@ from .transfer import fill_beyond
 from .units import Units
 from .wallfield import WallFields
 from .walls import WallSample
+from .work import energy_unit
 
 # a particle this far beyond a wall (spacings) counts as outside; the soft potential is meant to be entered a little
 _OUTSIDE = 0.5
@@ -36,6 +39,7 @@ class Domain:
         self.scene, self.scheme, self.units = scene, scheme, units
         self.device, self.dtype = device, dtype
         smoothing = kernel(scheme.kernel)
+        self._energy = energy_unit(units, scene.fluid.density, scene.dimension)
         self.support_radius = smoothing.support * scheme.smoothing_ratio
         self.period = self._period()
         self._steady_gravity = None
@@ -61,6 +65,9 @@ class Domain:
         from .reservoirs import Reservoirs  # here, because reservoirs need the domain's wall fields
         from .sources import Sources
 
+        given = [valve.region for valve in self.scene.valves if valve.pressure is not None]
+        if given and isinstance(self.scheme.valve, PressureSource):
+            raise ValueError(f"valves at a given pressure (regions {given}) need Reservoir, not PressureSource")
         if self.scene.valves and isinstance(self.scheme.valve, PressureSource):
             self.sources = Sources(self.scene, self.scheme.valve, self.units, self.device, self.dtype)
         if self.scene.valves and isinstance(self.scheme.valve, Reservoir):
@@ -115,7 +122,7 @@ class Domain:
         if self.walls is not None:
             times.update(self.walls.moments.within(start, stop))
         if self.scheme.valve is not None:
-            times.update(t for valve in self.scene.valves for t in valve.events())
+            times.update(t for valve in self.scene.valves for t in valve.events(start, stop))
         tolerance = 1e-9 * max(1.0, abs(stop))
         inner = sorted(t for t in times if start + tolerance < t < stop - tolerance)
         return [*inner, stop] if stop > start else []
@@ -173,22 +180,24 @@ class Domain:
             share = (self._times - early) / (late - early)
             fraction = share.clamp(0.0, 1.0).to(self.dtype)
             fraction = per_particle(fraction, particles.member) if fraction.ndim else fraction
-        return self.walls.sample(self._fields, fraction, self._wrapped_points(particles.position))
+        return self.walls.sample(self._fields, fraction, self.wrapped(particles.position))
 
     def sample_at(self, position: Tensor) -> WallSample:
         """Walls at points (n, D), internal, at the present time (one for all members)."""
         early, late = self._bracket
         share = float((self._times.max() - early) / (late - early)) if late > early else 0.0
         fraction = torch.full((), min(max(share, 0.0), 1.0), dtype=self.dtype, device=self.device)
-        return self.walls.sample(self._fields, fraction, self._wrapped_points(position))
+        return self.walls.sample(self._fields, fraction, self.wrapped(position))
 
     def body_force(self, particles: Particles) -> Tensor | None:
         """Acceleration (N, D) by gravity and pressure sources, or None."""
         total = self._gravity(particles)
-        if self.sources is not None and self._open:
+        push = None
+        if self.sources is not None:
             push = self.sources.acceleration(particles, self._open, self.time_of(particles))
-            total = push if total is None else total + push
-        return total
+        if push is None or total is None:
+            return total if push is None else push
+        return total + push
 
     def _gravity(self, particles: Particles) -> Tensor | None:
         """Gravity at the particles' present times (N, D) or None."""
@@ -207,16 +216,25 @@ class Domain:
         """What an interval needs before its first step: buffers behind valves that have just opened."""
         return particles if self.reservoirs is None else self.reservoirs.opened(particles)
 
-    def finish(self, particles: Particles, record: Record, time: float) -> Particles:
+    def finish(
+        self, particles: Particles, record: Record, time: float, pressure: Callable[[Particles], Tensor]
+    ) -> Particles:
         """What an interval leaves behind: periodic positions wrapped, particles gone through a valve taken out."""
         particles = self._wrapped(particles)
-        return particles if self.sources is None else self.sources.without_gone(particles, self._open, time, record)
+        if self.sources is None:
+            return particles
+        return self.sources.without_gone(particles, self._open, time, record, pressure)
 
-    def exchange(self, particles: Particles, record: Record) -> tuple[Particles, bool]:
-        """Pass particles between fluid and buffers; True where the particles were renumbered."""
+    def exchange(
+        self, particles: Particles, record: Record, pressure: Callable[[Particles], Tensor]
+    ) -> tuple[Particles, bool]:
+        """Pass particles between fluid and buffers; True where the particles were renumbered.
+
+        ``pressure`` gives p / rho0 of particles, for the account of the energy that passes.
+        """
         if self.reservoirs is None or not self._open:
             return particles, False
-        return self.reservoirs.exchange(particles, record)
+        return self.reservoirs.exchange(particles, record, pressure)
 
     def constrain(
         self, before: Particles, after: Particles, wall: WallSample | None, step: Tensor, record: Record
@@ -242,6 +260,8 @@ class Domain:
         record.crossed_wall.index_add_(0, after.member[near], (distance < 0).to(torch.int64))
         velocity = after.velocity[near]
         towards = ((velocity - wall.velocity[near]) * normal).sum(1).clamp_max(0.0)
+        done = -(after.mass[near] * towards * (normal * wall.velocity[near]).sum(1)).double() * self._energy
+        record.wall_work.index_add_(0, after.member[near], done.nan_to_num(0.0, 0.0, 0.0))
         return after.changed(
             position=after.position.index_add(0, near, (gap - distance)[:, None] * normal),
             velocity=after.velocity.index_add(0, near, -towards[:, None] * normal),
@@ -249,10 +269,10 @@ class Domain:
 
     def _wrapped(self, particles: Particles) -> Particles:
         return particles if self.period is None else particles.changed(
-            position=self._wrapped_points(particles.position)
+            position=self.wrapped(particles.position)
         )
 
-    def _wrapped_points(self, position: Tensor) -> Tensor:
+    def wrapped(self, position: Tensor) -> Tensor:
         """Points (n, D), internal, brought back into the periodic box."""
         if self.period is None:
             return position
@@ -260,14 +280,35 @@ class Domain:
         length = torch.where(finite, self.period, torch.ones_like(self.period))
         return torch.where(finite, torch.remainder(position, length), position)
 
-    def account(self, particles: Particles, record: Record, time: float) -> None:
-        """Count the particles that are beyond the walls now."""
+    def shortest(self, way: Tensor) -> Tensor:
+        """Differences (n, D) of positions, internal, the shortest way around the periodic box."""
+        if self.period is None:
+            return way
+        finite = torch.isfinite(self.period)
+        length = torch.where(finite, self.period, torch.ones_like(self.period))
+        return torch.where(finite, way - length * torch.round(way / length), way)
+
+    def beyond_valves(self, position: Tensor) -> Tensor:
+        """(n,) bool: points (n, D), internal, at an open valve or behind it, where the walls' distance knows no end."""
+        beyond = torch.zeros_like(position[:, 0], dtype=torch.bool)
+        if self.reservoirs is not None:
+            for _, frame in self.reservoirs.active():
+                beyond |= frame.behind(position)
+        if self.sources is not None:
+            for region in self._open:
+                beyond |= self.sources.behind(position, region, self.middle)
+        return beyond
+
+    def account(self, particles: Particles, record: Record, time: float, since: float) -> None:
+        """Count the particles beyond the walls now, at ``time`` (s), and the volumes; the run began at ``since``."""
         self.at(time)
         wall = self.sample(particles)
         if wall is not None:
             beyond = (wall.distance < -_OUTSIDE) & particles.fluid
             record.outside = particles.per_member(beyond.to(torch.int64), "sum")
             record.filling = self.filling(particles, time)
+            if self.scene.walls.moves:
+                record.cavity_change.fill_(self.fluid_volume(time) - self.fluid_volume(since))
 
     def imposed(self, particles: Particles, grid: Grid, velocity: Tensor, mask: Tensor, time: float) -> Particles:
         """Particles with the velocity of a grid field, continued beyond its mask by the walls' velocity."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from .population import PopulationControl
 from .schemes import CompleteKernelWall, Reservoir
 from .smoothing import kernel
 
@@ -26,6 +27,7 @@ class Projection:
         wall, valve: models for scenes with walls and valves; the valve stays shut with None.
         courant: fraction of the limits h / v, h^2 / (8 nu) and sqrt(h / |a|) / 2. max_step: s, or None.
         steps_per_frame: at least so many steps between imposed frames, or None.
+        population: how particles that crowd are merged and holes seeded again, or None: neither.
     """
 
     kernel: str = "wendland_c2"
@@ -43,6 +45,7 @@ class Projection:
     courant: float = 0.27
     max_step: float | None = 5e-4
     steps_per_frame: int | None = None
+    population: PopulationControl | None = None
 
     def __post_init__(self) -> None:
         kernel(self.kernel)

@@ -15,7 +15,14 @@ from .particles import Particles
 from .schemes import CompleteKernelWall, PotentialWall, WeaklyCompressible
 from .second_order import predictor_corrector_step, verlet_step
 from .smoothing import kernel
-from .terms import mls_deviation, shepard_deviation, shifting_displacement, softened_share, tait_pressure
+from .terms import (
+    mls_deviation,
+    shepard_deviation,
+    shifting_displacement,
+    softened_share,
+    tait_deviation,
+    tait_pressure,
+)
 from .transfer import solve_small
 from .walls import SMALLEST_SHARE, WallSample, completed, friction, potential_force, retardation, wall_pressure_force
 from .xsph import neighbour_pull
@@ -50,6 +57,7 @@ class Stepper:
     ) -> None:
         """``buffered``: whether there can be particles of reservoirs, which are not the stepper's to move."""
         self.scheme, self.pair_search, self.dimension, self._buffered = scheme, search, dimension, buffered
+        self.held_kinds: Tensor | None = None  # kinds of the buffers whose pressure, and so density, is given
         self.use(coefficients)
 
     def use(self, coefficients: Coefficients) -> None:
@@ -239,7 +247,15 @@ class Stepper:
         if self.scheme.constant_volume:
             mean = particles.per_member(rate, "sum") / particles.per_member(torch.ones_like(rate), "sum").clamp_min(1.0)
             rate = rate - per_particle(mean, particles.member)
+        if self.held_kinds is not None:
+            rate = torch.where(torch.isin(particles.kind, self.held_kinds), torch.zeros_like(rate), rate)
         return rate
+
+    def at_pressure(self, particles: Particles, row: Tensor, pressure: Tensor) -> Particles:
+        """Particles whose ``row`` (n,) have the density that the equation of state gives to ``pressure`` (n,)."""
+        c, member = self.coefficients, particles.member[row]
+        deviation = tait_deviation(pressure, per_particle(c.sound_speed, member), per_particle(c.gamma, member))
+        return particles.changed(deviation=particles.deviation.index_copy(0, row, deviation))
 
     def pressure(self, particles: Particles, divergence: Tensor | None = None) -> Tensor:
         """p / rho0 (N,): equation of state, background (symmetric form only), damping of sound.

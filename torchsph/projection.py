@@ -34,6 +34,8 @@ _SHARES = 16
 _LARGEST_MOVE = 0.2
 # part of a full kernel's moment below which no slope is drawn from what is left of it
 _SMALLEST_MOMENT = 0.3
+# cosine between the share's gradient and the wall's normal below which a wall is not plain
+_EDGE = 0.9
 
 
 @dataclass(frozen=True)
@@ -83,7 +85,8 @@ class Neighbourhood:
 
         Of a jump at the wall the kernels of the fluid see the half that lies on their side; a wall that accelerates
         would so be followed by halves only. The fluid's normal velocity is continued linearly to the wall first, so
-        that a flow that keeps to the wall has no jump.
+        that a flow that keeps to the wall has no jump. Meant for walls that move: what it adds to those at rest is
+        noise at their edges.
         """
         p, wall = self.particles, self.wall
         steep = wall.share_gradient.norm(dim=1)
@@ -94,39 +97,55 @@ class Neighbourhood:
         moment = (wall.share - wall.distance * steep).clamp_min(_SMALLEST_MOMENT)
         rise = -(fall * wall.normal).sum(1) / moment
         jump = (wall.velocity * wall.normal).sum(1) - along + wall.distance.clamp_min(0.0) * rise
-        return torch.where(p.fluid, jump * steep / self.share, torch.zeros_like(jump))
+        # where walls meet at an edge there is no such line to continue on
+        cosine = (wall.share_gradient * wall.normal).sum(1) / steep.clamp_min(_TINY)
+        plain = (cosine - _EDGE).clamp_min(0.0) / (1.0 - _EDGE)
+        return torch.where(p.fluid, plain * jump * steep / self.share, torch.zeros_like(jump))
 
     def divergence(self, sums: Rates) -> tuple[Tensor, Tensor | None]:
         """Velocity divergence (N,) for the pressure to answer, and the crowding gradient (N, D), complete at walls."""
         p, wall = self.particles, self.wall
         divergence, crowding = completed(sums.divergence, sums.concentration, p.velocity, wall)
-        return (divergence if wall is None else divergence - self.wall_jump()), crowding
+        moves = wall is not None and bool(wall.velocity.any())
+        return (divergence - self.wall_jump() if moves else divergence), crowding
 
     def push(
-        self, source: Tensor, start: Tensor | None, surface: Tensor | None, tolerance: float, iterations: int
+        self, source: Tensor, start: Tensor | None, surface: Tensor | None, tolerance: float, iterations: int,
+        held: Tensor | None = None,
     ) -> tuple[Tensor, PoissonSolution]:
         """Solve -laplacian(u) = ``source`` (N,); minus the gradient of u (N, D), 0 in reservoirs, and the solution.
 
-        Walls and buffers are impermeable to u (Neumann); where ``surface`` (N,) bool u is 0.
+        The solution is continued into reservoirs. Walls and buffers are impermeable to u (Neumann); where ``surface``
+        (N,) bool u is 0, where ``held`` (N,) bool, in buffers, it is as in ``start``.
         """
         p, backend = self.particles, self.search.backend
         state, fluid = p.state(p.deviation), p.fluid
-        diagonal = backend.laplacian(self.pairs, state, self.support, torch.zeros_like(source), fluid)[1]
+        coupled = fluid if held is None else fluid | held
+        diagonal = backend.laplacian(self.pairs, state, self.support, torch.zeros_like(source), coupled)[1]
         free, singular = fluid, torch.ones(p.members, dtype=torch.bool, device=fluid.device)
         if surface is not None:
             free = fluid & ~surface
             singular = p.per_member(surface.to(torch.int64), "sum") == 0
+        if held is not None:
+            singular = singular & (p.per_member(held.to(torch.int64), "sum") == 0)
         problem = PoissonProblem(
-            lambda u: backend.laplacian(self.pairs, state, self.support, u, fluid)[0], diagonal, p.mass, free, singular,
-            p.member, p.members,
+            lambda u: backend.laplacian(self.pairs, state, self.support, u, coupled)[0], diagonal, p.mass, free,
+            singular, p.member, p.members,
         )
-        found = solve(problem, source * self.share, start, tolerance=tolerance, iterations=iterations)
+        source = source * self.share
+        if held is not None:
+            kept = torch.where(held, start, torch.zeros_like(start))
+            source = source - problem.apply(kept)
+        found = solve(problem, source, start, tolerance=tolerance, iterations=iterations)
+        if held is not None:
+            found = replace(found, values=found.values + kept)
         if self.wall is not None:
             part = problem.total(torch.where(fluid, p.mass * self.share, torch.zeros_like(source)))
             whole = problem.total(torch.where(fluid, p.mass, torch.zeros_like(source)))
             found = replace(found, mismatch=found.mismatch * whole / part.clamp_min(_TINY))
         terms = MomentumTerms(pressure="difference")
-        slope = backend.momentum(self.pairs, p.state(self._continued(found.values)), self.support, terms)
+        found = replace(found, values=self._continued(found.values, held))
+        slope = backend.momentum(self.pairs, p.state(found.values), self.support, terms)
         slope = slope / self.share[:, None] if self.wall is not None else slope
         slope = torch.where(fluid[:, None], slope, torch.zeros_like(slope))
         return (slope if self.wall is not None else self._without_thrust(slope)), found
@@ -141,9 +160,9 @@ class Neighbourhood:
         thrust = push.new_zeros((p.members, push.shape[1])).index_add(0, p.member, p.mass[:, None] * push)
         return push - (thrust / mass[:, None]).index_select(0, p.member)
 
-    def _continued(self, values: Tensor) -> Tensor:
-        """Values of the fluid, and in buffers the mean of the fluid around: (N,)."""
-        fluid = self.particles.fluid
+    def _continued(self, values: Tensor, held: Tensor | None) -> Tensor:
+        """Values of the fluid and where ``held``, and in other buffers the mean of the fluid around: (N,)."""
+        fluid = self.particles.fluid if held is None else self.particles.fluid | held
         if bool(fluid.all()):
             return values
         part = torch.where(fluid, self.particles.mass, torch.zeros_like(values))
@@ -206,6 +225,7 @@ class ProjectionStepper:
         self, scheme: Projection, coefficients: Coefficients, search: PairSearch, dimension: int, record: Record
     ) -> None:
         self.scheme, self.pair_search, self.dimension, self._record = scheme, search, dimension, record
+        self.held_kinds: Tensor | None = None  # kinds of the buffers whose pressure is given
         self.use(coefficients)
 
     def use(self, coefficients: Coefficients) -> None:
@@ -220,6 +240,16 @@ class ProjectionStepper:
             concentration=coefficients.shifting is not None,
             shepard=self.scheme.relaxation is not None or self.scheme.surface is not None,
         )
+
+    @staticmethod
+    def at_pressure(particles: Particles, row: Tensor, pressure: Tensor) -> Particles:
+        """Particles whose ``row`` (n,) carry ``pressure`` (n,), p / rho0, into the next projection."""
+        return particles.changed(pressure=ProjectionStepper.pressure(particles).index_copy(0, row, pressure))
+
+    @staticmethod
+    def pressure(particles: Particles) -> Tensor:
+        """p / rho0 (N,) of the last projection; 0 before the first."""
+        return torch.zeros_like(particles.mass) if particles.pressure is None else particles.pressure
 
     def step(
         self, particles: Particles, step: Tensor, number: Tensor, around: Surroundings
@@ -246,8 +276,9 @@ class ProjectionStepper:
         if self.scheme.relaxation is not None:
             counted = particles.inside if surface is None else particles.inside & ~surface
             source = source + here.excess(filling, counted) / self.scheme.relaxation
+        held = None if self.held_kinds is None else torch.isin(particles.kind, self.held_kinds)
         push, found = here.push(
-            source, self._guess(particles, dt), surface, self.scheme.tolerance, self.scheme.iterations
+            source, self._guess(particles, dt), surface, self.scheme.tolerance, self.scheme.iterations, held
         )
         self._account(found, step)
         velocity = particles.velocity + push

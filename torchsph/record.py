@@ -21,8 +21,16 @@ class Record:
         outside: particles beyond the wall now, in no open valve.
         crossed_wall: how often a particle was found beyond the wall and put back.
         inserted, removed: particles that entered and left, by valve: (members, valves).
+        merged, reseeded: particles that population control merged into others, and that it put into holes.
         inflow, outflow: volume that entered and left, by valve, m^D (in a plane m^2): (members, valves).
-        filling: volume of the particles inside over that of the cavity now; NaN in scenes without walls.
+        cavity_change: of the cavity's volume since the run began, m^D: what has to enter less what leaves.
+        energy_in, energy_out: kinetic energy and work of pressure that entered and left with it, by valve, J (in a
+            plane J/m): (members, valves).
+        wall_work: done on the fluid by moving walls: pressure, friction and stops; J (in a plane J/m).
+        source_work: done on the fluid by pressure sources, J (in a plane J/m).
+        filling: volume of the particles inside over that of the cavity now; NaN in scenes without walls. Where a closed
+            cavity changes its volume, it goes along: a weakly compressible fluid is compressed or thinned, and the
+            incompressible scheme reports the mismatch below.
         limited_by: how many steps each limit decided, (members, limits); names in ``terms.LIMITS``.
         reductions: how often a limit asked for a step shorter than the step before by more than a hundredth.
         floored: steps that the scheme's floor kept longer than the limits asked for; such a run may be unstable.
@@ -48,8 +56,15 @@ class Record:
     crossed_wall: Tensor = field(init=False)
     inserted: Tensor = field(init=False)
     removed: Tensor = field(init=False)
+    merged: Tensor = field(init=False)
+    reseeded: Tensor = field(init=False)
     inflow: Tensor = field(init=False)
     outflow: Tensor = field(init=False)
+    cavity_change: Tensor = field(init=False)
+    energy_in: Tensor = field(init=False)
+    energy_out: Tensor = field(init=False)
+    wall_work: Tensor = field(init=False)
+    source_work: Tensor = field(init=False)
     filling: Tensor = field(init=False)
     limited_by: Tensor = field(init=False)
     reductions: Tensor = field(init=False)
@@ -66,13 +81,18 @@ class Record:
         self.steps, self.outside, self.crossed_wall = counts(), counts(), counts()
         self.reductions, self.floored, self.rollbacks = counts(), counts(), counts()
         self.pressure_iterations, self.unconverged = counts(), counts()
+        self.merged, self.reseeded = counts(), counts()
         self.inserted, self.removed, self.limited_by = counts(self.valves), counts(self.valves), counts(len(LIMITS))
         self.failed = torch.zeros(self.members, dtype=torch.bool, device=self.device)
         one = torch.ones(self.members, dtype=torch.float64, device=self.device)
         self.smallest_density, self.largest_density = one.clone(), one.clone()
-        self.inflow, self.outflow = (one[:, None].repeat(1, self.valves) * 0.0 for _ in range(2))
+        self.inflow, self.outflow, self.energy_in, self.energy_out = (
+            one[:, None].repeat(1, self.valves) * 0.0 for _ in range(4)
+        )
         self.filling = one * float("nan")
-        self.largest_mach, self.largest_mismatch = torch.zeros_like(one), torch.zeros_like(one)
+        self.largest_mach, self.largest_mismatch, self.cavity_change, self.wall_work, self.source_work = (
+            torch.zeros_like(one) for _ in range(5)
+        )
 
     def note_density(self, smallest: Tensor, largest: Tensor) -> None:
         """Widen the density range by deviations (members,) from the rest density."""
@@ -84,7 +104,7 @@ class Record:
         return {
             "steps": int(self.steps.sum()), "failed": int(self.failed.sum()), "outside": int(self.outside.sum()),
             "crossed_wall": int(self.crossed_wall.sum()), "inserted": int(self.inserted.sum()),
-            "removed": int(self.removed.sum()),
+            "removed": int(self.removed.sum()), "merged": int(self.merged.sum()), "reseeded": int(self.reseeded.sum()),
         }
 
     def summary(self) -> dict[str, object]:
@@ -96,6 +116,10 @@ class Record:
             "largest_mach": self.largest_mach.tolist(), "outside": self.outside.tolist(),
             "crossed_wall": self.crossed_wall.tolist(), "inserted": self.inserted.tolist(),
             "removed": self.removed.tolist(), "inflow": self.inflow.tolist(), "outflow": self.outflow.tolist(),
+            "cavity_change": self.cavity_change.tolist(),
+            "merged": self.merged.tolist(), "reseeded": self.reseeded.tolist(),
+            "energy_in": self.energy_in.tolist(), "energy_out": self.energy_out.tolist(),
+            "wall_work": self.wall_work.tolist(), "source_work": self.source_work.tolist(),
             "filling": self.filling.tolist(), "limited_by": steps, "searches": self.searches,
             "reductions": self.reductions.tolist(), "floored": self.floored.tolist(),
             "rollbacks": self.rollbacks.tolist(), "overflows": self.overflows,

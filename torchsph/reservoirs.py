@@ -10,6 +10,7 @@ free: there only the flux is prescribed, by the same change of speed for all, an
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -21,6 +22,7 @@ from geometry import OrificePlane, orifices
 from .pairs.interface import per_particle
 from .particles import CHANNEL, FLUID, RESERVOIR, Particles
 from .record import Record
+from .work import carried_energy, energy_unit
 
 if TYPE_CHECKING:
     from .domain import Domain
@@ -53,13 +55,16 @@ class Reservoirs:
         self.run_out = domain.scheme.valve.run_out
         self.far = self.run_out + self.length  # where the buffer ends
         self.relaxation = domain.scheme.valve.relaxation
+        self._energy = energy_unit(self.units, domain.scene.fluid.density, self.motion.dimension)
         self.times, self.flux, self.volume = self._tables()
         labels = {valve.region: number for number, valve in enumerate(self.valves)}
         # a region may consist of several openings; each has a buffer of its own
         self.openings = [one for one in orifices(self.motion) if one.label in labels]
         self.valve_of = [labels[one.label] for one in self.openings]
+        # openings whose flow follows from a given pressure instead (``pressure_valves``)
+        self.given = [n for n, valve in enumerate(self.valve_of) if self.valves[valve].pressure is not None]
         self.pace = self._pace()
-        self._frames: dict[tuple[int, int], _Frame] = {}
+        self._frames: dict[tuple[int, int], Frame] = {}
 
     def _pace(self) -> float | None:
         """Time (s) in which no opening's area, or place, changes by more than this module allows; None: they rest."""
@@ -101,7 +106,7 @@ class Reservoirs:
         the sum does not jump as it crosses.
         """
         part = particles.inside.to(particles.mass.dtype)
-        for _, frame in self._active():
+        for _, frame in self.active():
             height = frame.height(particles.position)
             row = torch.nonzero(height.abs() < _BLEND).squeeze(1)
             over = (frame.inset(particles.position[row]) + 0.5).clamp(0.0, 1.0)
@@ -124,7 +129,7 @@ class Reservoirs:
         mean = particles.per_member(weight * particles.deviation, "sum") / total
         return particles.changed(deviation=particles.deviation - per_particle(mean, particles.member))
 
-    def frame(self, number: int) -> _Frame:
+    def frame(self, number: int) -> Frame:
         """Opening ``number`` now, to within the little that it changes in ``pace``."""
         time = self.domain.now if self.pace is None else round(self.domain.now / self.pace) * self.pace
         if not self.motion.period:
@@ -134,13 +139,13 @@ class Reservoirs:
             if len(self._frames) > _KEPT_FRAMES:
                 self._frames.clear()
             opening = self.openings[number]
-            self._frames[label] = _Frame(
+            self._frames[label] = Frame(
                 opening.at(time), opening.velocity(time) / self.units.speed, self.units.length, self.domain.dtype,
                 self.domain.device,
             )
         return self._frames[label]
 
-    def _active(self) -> list[tuple[int, _Frame]]:
+    def active(self) -> list[tuple[int, Frame]]:
         """(number, frame) of the openings of open valves."""
         chosen = self.domain.open_regions
         return [(n, self.frame(n)) for n, one in enumerate(self.openings) if one.label in chosen]
@@ -151,15 +156,16 @@ class Reservoirs:
         With several valves open at once the cavity fills through the first and empties through the last of them;
         openings of one region share by area.
         """
-        regions = sorted(self.domain.open_regions)
+        given = {self.openings[n].label for n in self.given}
+        regions = sorted(set(self.domain.open_regions) - given)
         mine = self.openings[number].label
         part = inflow.clamp_min(0.0) * (mine == regions[0]) + inflow.clamp_max(0.0) * (mine == regions[-1])
-        total = sum(frame.area for n, frame in self._active() if self.openings[n].label == mine)
+        total = sum(frame.area for n, frame in self.active() if self.openings[n].label == mine)
         return part * (self.frame(number).area / total)
 
     def _lead(self, number: int) -> float:
         """Length of the free channel before the buffer of an opening: 0 where fluid enters in the present interval."""
-        if not self.run_out:
+        if not self.run_out or number in self.given:
             return 0.0
         middle = torch.tensor([self.domain.middle], dtype=torch.float64, device=self.domain.device)
         return self.run_out if float(self._flux_through(number, self.inflow(middle))) < 0.0 else 0.0
@@ -172,14 +178,14 @@ class Reservoirs:
             kind = torch.tensor([k for n in gone for k in (RESERVOIR + n, CHANNEL - n)], device=particles.kind.device)
             stay = ~torch.isin(particles.kind, kind)
             particles = particles if bool(stay.all()) else particles.select(stay)
-        for number, frame in self._active():
+        for number, frame in self.active():
             has = particles.per_member((particles.kind == RESERVOIR + number).to(torch.int64), "sum") > 0
             empty = torch.nonzero(~has).squeeze(1)
             if empty.numel():
                 particles = particles.joined(self._buffer(particles, number, frame, empty))
         return particles
 
-    def _buffer(self, particles: Particles, number: int, frame: _Frame, members: Tensor) -> Particles:
+    def _buffer(self, particles: Particles, number: int, frame: Frame, members: Tensor) -> Particles:
         """A fresh lattice in the channel of one valve for some members, its first part free where fluid leaves."""
         place = frame.lattice(self.far)
         kind = torch.where(frame.height(place) < self._lead(number), CHANNEL - number, RESERVOIR + number)
@@ -196,7 +202,7 @@ class Reservoirs:
         return new
 
     @staticmethod
-    def _mouth_deviation(particles: Particles, frame: _Frame, members: Tensor) -> Tensor:
+    def _mouth_deviation(particles: Particles, frame: Frame, members: Tensor) -> Tensor:
         """Mean density deviation of the fluid near an orifice, per member: what a new buffer starts with."""
         near = (particles.position - frame.centre).norm(dim=1) < frame.radius
         weight = (near & particles.fluid).to(particles.deviation.dtype)
@@ -211,11 +217,15 @@ class Reservoirs:
         times, channel = self.domain.member_times(particles.members), step is None
         times = times if channel else times + step.double() * self.units.time
         inflow = self.inflow(times)
-        if self.relaxation is not None and not channel:
+        active = self.active()
+        held = self.relaxation is not None and not any(number in self.given for number, _ in active)
+        if held and not channel:
             inflow = inflow + self._deficit(particles, times) / self.relaxation
             particles = self._levelled(particles)
         velocity = particles.velocity
-        for number, frame in self._active():
+        for number, frame in active:
+            if number in self.given:
+                continue
             mine, free = particles.kind == RESERVOIR + number, particles.kind == CHANNEL - number
             row, lead = torch.nonzero(mine | free if channel else mine).squeeze(1), self._lead(number)
             length = self.far if channel else self.far - lead
@@ -233,7 +243,7 @@ class Reservoirs:
                 velocity = self._carried(particles, velocity, free, frame, speed)
         return particles.changed(velocity=velocity)
 
-    def _carried(self, particles: Particles, velocity: Tensor, free: Tensor, frame: _Frame, speed: Tensor) -> Tensor:
+    def _carried(self, particles: Particles, velocity: Tensor, free: Tensor, frame: Frame, speed: Tensor) -> Tensor:
         """Velocities (N, D), in the free channel, ``free`` (N,) bool, with a mean that carries area times ``speed``.
 
         A pressure gradient along a straight channel speeds up all of it alike. The solver knows of none at the buffer,
@@ -278,10 +288,12 @@ class Reservoirs:
         scale = torch.where(flat, speed, speed / (total(shape) / count).clamp_min(1e-5))
         return torch.where(flat[owner], ones, shape) * scale[owner]
 
-    def exchange(self, particles: Particles, record: Record) -> tuple[Particles, bool]:
+    def exchange(
+        self, particles: Particles, record: Record, pressure: Callable[[Particles], Tensor]
+    ) -> tuple[Particles, bool]:
         """Turn particles that have crossed an open orifice into the other kind; feed and clear the far ends."""
         kind, gone, fresh = particles.kind, torch.zeros_like(particles.fluid), []
-        for number, frame in self._active():
+        for number, frame in self.active():
             height, lead = frame.height(particles.position), self._lead(number)
             buffer, channel = RESERVOIR + number, CHANNEL - number
             entered = ((kind == buffer) | (kind == channel)) & (height < 0.0)
@@ -299,11 +311,16 @@ class Reservoirs:
             kind = torch.where(entered, torch.full_like(kind, FLUID), kind)
             gone |= beyond & (height > self.far)
             valve, unit = self.valve_of[number], self.units.length**self.motion.dimension
-            for counter, volume, which in (
-                (record.inserted, record.inflow, entered), (record.removed, record.outflow, out),
+            for counter, volume, energy, which in (
+                (record.inserted, record.inflow, record.energy_in, entered),
+                (record.removed, record.outflow, record.energy_out, out),
             ):
-                counter[:, valve] += particles.per_member(which.to(torch.int64), "sum")
-                volume[:, valve] += particles.per_member((particles.mass * which).double(), "sum") * unit
+                if not bool(which.any()):
+                    continue
+                some = particles.select(which)
+                counter[:, valve] += some.per_member(torch.ones_like(some.member), "sum")
+                volume[:, valve] += some.per_member(some.mass.double(), "sum") * unit
+                energy[:, valve] += some.per_member(carried_energy(some, pressure(some)), "sum") * self._energy
         particles = particles.changed(kind=kind)
         if not fresh and not bool(gone.any()):
             return particles, False
@@ -312,13 +329,13 @@ class Reservoirs:
             particles = particles.joined(copy)
         return particles, True
 
-    def _left(self, kind: Tensor, height: Tensor, frame: _Frame, particles: Particles) -> Tensor:
+    def _left(self, kind: Tensor, height: Tensor, frame: Frame, particles: Particles) -> Tensor:
         """(N,) bool: particles of the fluid that have just left through an opening."""
         out = (kind == FLUID) & (height > _HYSTERESIS) & (height < self.far)
         return self._over(out, frame, particles)
 
     @staticmethod
-    def _over(candidates: Tensor, frame: _Frame, particles: Particles) -> Tensor:
+    def _over(candidates: Tensor, frame: Frame, particles: Particles) -> Tensor:
         """(N,) bool: those of the candidates (N,) bool that stand over the opening itself."""
         row = torch.nonzero(candidates).squeeze(1)
         if not row.numel():
@@ -332,7 +349,7 @@ class Reservoirs:
         A buffer so takes on the velocity profile that the field has at the orifice.
         """
         points = particles.position
-        for number, frame in self._active():
+        for number, frame in self.active():
             height = frame.height(points)
             inward = (-height - _MOUTH)[:, None] * frame.normal
             mine = (particles.kind == RESERVOIR + number) | (particles.kind == CHANNEL - number)
@@ -340,7 +357,7 @@ class Reservoirs:
         return points
 
 
-class _Frame:
+class Frame:
     """An opening in internal units on the device."""
 
     def __init__(
@@ -365,6 +382,12 @@ class _Frame:
     def inset(self, position: Tensor) -> Tensor:
         """In-plane distance from the rim, (n,), positive over the opening."""
         return self._plane.lateral_distance(position)
+
+    def behind(self, position: Tensor) -> Tensor:
+        """(n,) bool: points (n, D) less than half a spacing before the opening, or in the channel behind it."""
+        height = self.height(position)
+        aside = (position - self.centre - height[:, None] * self.normal).norm(dim=1)
+        return (height > -0.5) & (aside < self.radius + 1.0)
 
     def lattice(self, length: float) -> Tensor:
         """Unit lattice in the channel of the given length behind the opening, (n, D)."""

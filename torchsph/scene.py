@@ -35,10 +35,21 @@ class Valve:
     Attributes:
         region: label of its faces in the wall (1 mitral inlet, 2 aortic outlet, further ones allowed).
         intervals: rows (opening time, closing time), s.
+        period: s, after which the intervals repeat; 0: they do not.
+        span: (first, last) time, s, that the intervals speak of; with a period, times beyond are brought back by whole
+            periods, as those of a wall's motion are. None: one period from the first opening on.
+        pressure: Pa, a number or a function of time (s); flow through the open valve then follows from it, instead of
+            the change of the cavity's volume (None). Only differences between valves that are open together matter.
+        stagnation: whether ``pressure`` is that of still fluid behind the valve, of which fluid that enters has spent
+            rho v^2 / 2 (Bernoulli), or the static pressure in the opening itself. Fluid leaves against either alike.
     """
 
     region: int
     intervals: tuple[tuple[float, float], ...]
+    period: float = 0.0
+    span: tuple[float, float] | None = None
+    pressure: float | Callable[[float], float] | None = None
+    stagnation: bool = True
 
     def __post_init__(self) -> None:
         if self.region < 1:
@@ -46,14 +57,54 @@ class Valve:
         for opening, closing in self.intervals:
             if not closing > opening:
                 raise ValueError(f"valve of region {self.region}: closes at {closing} s before it opens at {opening} s")
+        if not 0 <= self.period < math.inf:
+            raise ValueError(f"Valve.period must be finite and not negative (s), got {self.period}")
+        if self.period and not all(math.isfinite(t) for interval in self.intervals for t in interval):
+            raise ValueError(f"valve of region {self.region}: intervals that repeat must be finite: {self.intervals}")
+        if self.span is not None and not self.span[1] - self.span[0] >= self.period * (1 - 1e-9):
+            raise ValueError(f"Valve.span must cover the period of {self.period} s, got {self.span}")
+
+    def pressure_at(self, time: float) -> float:
+        """The given pressure (Pa) at ``time`` (s).
+
+        Raises ValueError where it is not finite.
+        """
+        value = float(self.pressure(time) if callable(self.pressure) else self.pressure)
+        if not math.isfinite(value):
+            raise ValueError(f"Valve.pressure of region {self.region} must be finite (Pa), got {value} at {time:g} s")
+        return value
 
     def is_open(self, time: float) -> bool:
         """Whether the valve is open at ``time`` (s); closed at the closing instant itself."""
-        return any(opening <= time < closing for opening, closing in self.intervals)
+        times = [time]
+        if self.period and self.intervals:
+            first, last = self._covered
+            if time > last:
+                time -= math.ceil((time - last) / self.period) * self.period
+            elif time < first:
+                time += math.ceil((first - time) / self.period) * self.period
+            # an interval may reach over the end of what is known
+            times = [time] + [t for t in (time - self.period, time + self.period) if not first <= t <= last]
+        return any(opening <= t < closing for opening, closing in self.intervals for t in times)
 
-    def events(self) -> tuple[float, ...]:
-        """All opening and closing times, s."""
-        return tuple(t for interval in self.intervals for t in interval)
+    def events(self, start: float, stop: float) -> list[float]:
+        """Times in [start, stop], s, at which the valve may open or close."""
+        times = [t for interval in self.intervals for t in interval]
+        if not self.period or not times:
+            return [t for t in times if start <= t <= stop]
+        found: set[float] = set()
+        for t in (*times, *self._covered):
+            beats = range(math.ceil((start - t) / self.period), math.floor((stop - t) / self.period) + 1)
+            found.update(t + beat * self.period for beat in beats)
+        return sorted(found)
+
+    @property
+    def _covered(self) -> tuple[float, float]:
+        """What the intervals speak of, s."""
+        if self.span is not None:
+            return self.span
+        first = min(opening for opening, _ in self.intervals)
+        return first, first + self.period
 
 
 @dataclass(frozen=True)
@@ -118,10 +169,17 @@ class Scene:
         """
         intervals = recording.valve_intervals_or_derived()
         regions: dict[int, list[tuple[float, float]]] = {}
+        span = (float(recording.time[0]), max(float(recording.time[-1]), float(recording.time[0]) + recording.period))
         for region, opening, closing in ([] if intervals is None else intervals):
-            regions.setdefault(int(region), []).append((float(opening), float(closing)))
+            rows = regions.setdefault(int(region), [])
+            if recording.period:  # what was open at the first or last frame was so at the ends of what is known
+                opening = float(opening) if math.isfinite(opening) else span[0]
+                closing = float(closing) if math.isfinite(closing) else span[1]
+            rows.append((float(opening), float(closing)))
         present = {int(region) for region in recording.wall.region}
-        valves = tuple(Valve(r, tuple(sorted(rows))) for r, rows in sorted(regions.items()) if r in present)
+        valves = tuple(
+            Valve(r, tuple(sorted(rows)), recording.period, span) for r, rows in sorted(regions.items()) if r in present
+        )
         return cls(
             spacing=float(min(recording.grid.spacing)) if spacing is None else spacing,
             fluid=Fluid(recording.rho, recording.mu),

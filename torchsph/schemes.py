@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from .pairs.interface import CONTINUITY_FORMS, PRESSURE_FORMS
+from .population import PopulationControl
 from .smoothing import kernel
 
 ORDERS = ("thesis", "symplectic", "verlet", "predictor_corrector")
@@ -201,6 +202,7 @@ class WeaklyCompressible:
             runaway particle then cannot stall a run; the record counts the steps that the floor held up.
         rollback: second chances for members that fail, or None: they are frozen at once.
         steps_per_frame: at least so many steps between imposed frames, or None.
+        population: how particles that crowd are merged and holes seeded again, or None: neither.
     """
 
     kernel: str = "wendland_c2"
@@ -231,6 +233,7 @@ class WeaklyCompressible:
     step_floor: float | None = 0.02
     rollback: Rollback | None = None
     steps_per_frame: int | None = None
+    population: PopulationControl | None = None
     gamma_ramp: GammaRamp | None = None
 
     def __post_init__(self) -> None:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
+
+from geometry import WallMotion
 
 from .neighbours import PairSearch
 from .pairs import backend as choose_backend
@@ -83,6 +85,28 @@ def seed_particles(simulator: Simulator, time: float, generator: torch.Generator
     if seeding.kind != "quiet" or soft or not seeding.packings:
         return resting
     return packed(simulator, resting, time, seeding.packings)
+
+
+@dataclass(frozen=True)
+class ResidualMotion:
+    """How a fluid moves that should rest: RMS and largest speed of its particles, m/s."""
+
+    rms: float
+    largest: float
+
+
+def residual_motion(simulator: Simulator, time: float, *, duration: float = 0.02, seed: int = 0) -> ResidualMotion:
+    """What a start at ``time`` (s) leaves moving after ``duration`` (s), with walls held still and no forces or valves.
+
+    None of it is flow: it is the noise floor of what is imposed on such a start.
+    """
+    walls = simulator.scene.walls
+    still = None if walls is None else WallMotion.at_rest(walls.surface(time))
+    scene = replace(simulator.scene, walls=still, valves=(), gravity=None)
+    run = replace(simulator, scene=scene).start(0.0, seed=seed)
+    run.advance(duration)
+    speed = run.particles.velocity.double().norm(dim=1) * run.units.speed
+    return ResidualMotion(float(speed.square().mean().sqrt()), float(speed.max()))
 
 
 def _neighbours(simulator: Simulator) -> tuple[Support, PairSearch]:

@@ -18,12 +18,15 @@ from .neighbours import PairSearch
 from .pairs import backend as choose_backend
 from .parameters import Coefficients, Parameters
 from .particles import Particles
+from .population import Population
+from .pressure_valves import PressureValves
 from .projection import Neighbourhood, ProjectionStepper, check_filled, divergence_free
 from .record import Record
 from .rollback import Checkpoints
 from .schemes import CompleteKernelWall
 from .stepping import StepControl
 from .transfer import Fetched, fetch_at, pulled
+from .work import WorkAccount
 
 if TYPE_CHECKING:
     from .simulator import Simulator
@@ -66,8 +69,13 @@ class Simulation:
         else:
             self._stepper = Stepper(scheme, self._coefficients, search, scene.dimension, buffered=buffered)
         self._control = StepControl(self.record, scheme.step_floor)
+        self._work = WorkAccount.of(self.domain, self.record)
+        self._population = Population.of(self.domain, self._backend, self.record, particles, self.time)
+        self._pressures = PressureValves.of(self.domain, self._backend)
+        if self._pressures is not None:
+            self._stepper.held_kinds = self._pressures.kinds
         self._acceleration = torch.zeros_like(particles.position)
-        self._imposed_at = self.time
+        self._began_at = self._imposed_at = self.time
         self._order: Tensor | None = None  # of the particles in space when they were last sorted
         self._sort_at = 0  # number of searches at which they are sorted again
 
@@ -96,12 +104,12 @@ class Simulation:
             self._forget_pairs()
             self._advance_interval(stop, longest)
             self.time = stop
-            self.particles = self.domain.finish(self.particles, self.record, stop)
+            self.particles = self.domain.finish(self.particles, self.record, stop, self._stepper.pressure)
             self._forget_pairs()
         self._unsort()
         self.record.searches = self._stepper.pair_search.searches
         self.record.overflows = self._backend.overflows
-        self.domain.account(self.particles, self.record, self.time)
+        self.domain.account(self.particles, self.record, self.time, self._began_at)
 
     def _longest_step(self, until: float) -> float:
         """Limit of the steps to time ``until`` (s) that the scheme names outright, internal."""
@@ -152,6 +160,10 @@ class Simulation:
             )
             self.domain.at(self.time + done * self.units.time)
             self._pass_valves()
+            if self._population is not None:
+                self._control_population(step > 0)
+            if self._pressures is not None:
+                self.particles = self._pressures.driven(self.particles, self._stepper)
             self._sort_when_due()
             done = self._take_step(step, done, checkpoints)
 
@@ -169,12 +181,18 @@ class Simulation:
 
     def _pass_valves(self) -> None:
         """Particles that have crossed an open valve change sides, in every step: the flow must not feel the search."""
-        before = self.particles.count
-        self.particles, renumbered = self.domain.exchange(self.particles, self.record)
+        self.particles, renumbered = self.domain.exchange(self.particles, self.record, self._stepper.pressure)
         if renumbered:
             self._forget_pairs()
-        if self.particles.count != before:
-            self._acceleration = torch.zeros_like(self.particles.position)
+
+    def _control_population(self, active: Tensor) -> None:
+        """Merge and seed particles in the members (members,) bool whose turn it is."""
+        due = active & (self.record.steps % self._population.options.every == 0)
+        if not bool(due.any()):
+            return
+        self.particles, changed = self._population.controlled(self.particles, due)
+        if changed:
+            self._forget_pairs()
 
     def _sort_when_due(self) -> None:
         """Now and then, where the neighbours are to be searched anyway, sort large sets in space."""
@@ -207,8 +225,8 @@ class Simulation:
         """Step every member by its own ``step`` (members,); how far each has come in the interval (members,)."""
         before, push = self.particles, self._acceleration
         inner = step.to(before.position.dtype)
-        after, acceleration, wall = self._stepper.step(before, inner, self.record.steps, self.domain)
-        after = self.domain.constrain(before, after, wall, inner, self.record)
+        stepped, acceleration, wall = self._stepper.step(before, inner, self.record.steps, self.domain)
+        after = self.domain.constrain(before, stepped, wall, inner, self.record)
         waiting = step == 0
         if bool(waiting.any()):
             after, acceleration = _held(waiting, before, after), _held_rows(waiting, before, push, acceleration)
@@ -216,6 +234,8 @@ class Simulation:
         lowest, highest = (after.per_member(after.deviation, way) for way in ("amin", "amax"))
         self.record.note_density(lowest, highest)
         broken = self._broken(lowest, highest) & ~self.record.failed
+        if self._work is not None:
+            self._work.note(before, stepped, wall, inner, self._stepper, (step > 0) & ~broken)
         if bool(broken.any()):
             done = self._recover(broken, before, push, done, checkpoints)
         return done

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -15,6 +16,7 @@ from .record import Record
 from .scene import Scene
 from .schemes import PressureSource
 from .units import Units
+from .work import carried_energy, energy_unit
 
 
 class Sources:
@@ -23,6 +25,9 @@ class Sources:
     The flux q(t) = dV/dt through the orifice, spread over a half-sphere around its centre, has the radial speed
     q / (2 pi r^2); changing it needs the acceleration (dq/dt) / (2 pi r^2) towards the cavity, so Q = dq/dt / (2 pi)
     in 3.4 (in a plane: half-circle, dq/dt / (pi r)). A core radius replaces r by sqrt(r^2 + core^2).
+
+    Attributes:
+        push: (N, D), the last acceleration, internal, for the account of the work; None while all valves are shut.
     """
 
     def __init__(
@@ -42,7 +47,8 @@ class Sources:
             self._core[valve.region] = model.core * radius / units.length
             centre = np.stack([plane.centroid for plane in planes]) / units.length
             self._track[valve.region] = (centre, np.stack([plane.normal for plane in planes]))
-        self.dimension = scene.dimension
+        self.dimension, self._density = scene.dimension, scene.fluid.density
+        self.push: Tensor | None = None
 
     def strength(self, time: float) -> float:
         """d^2 V / dt^2 of the cavity (m^3/s^2), by central differences of the exact dV/dt over a millisecond."""
@@ -52,8 +58,12 @@ class Sources:
             return 0.0
         return (self.motion.volume_rate(late) - self.motion.volume_rate(early)) / (late - early)
 
-    def acceleration(self, particles: Particles, open_regions: tuple[int, ...], times: Tensor) -> Tensor:
-        """-grad V (3.4) of the open valves at the particles, (N, D), internal."""
+    def acceleration(self, particles: Particles, open_regions: tuple[int, ...], times: Tensor) -> Tensor | None:
+        """-grad V (3.4) of the open valves at the particles, (N, D), internal; None where none is open."""
+        self.push = None if not open_regions else self._acceleration(particles, open_regions, times)
+        return self.push
+
+    def _acceleration(self, particles: Particles, open_regions: tuple[int, ...], times: Tensor) -> Tensor:
         time = float(times.mean()) if times.numel() else 0.0
         unit = self.units.length**self.dimension / self.units.time**2
         share = self.strength(time) / unit / len(open_regions)
@@ -68,7 +78,8 @@ class Sources:
         return total
 
     def without_gone(
-        self, particles: Particles, open_regions: tuple[int, ...], time: float, record: Record
+        self, particles: Particles, open_regions: tuple[int, ...], time: float, record: Record,
+        pressure: Callable[[Particles], Tensor],
     ) -> Particles:
         """Take out the particles that are more than a spacing beyond an open orifice, and count them."""
         gone = torch.zeros(particles.count, dtype=torch.bool, device=particles.position.device)
@@ -77,9 +88,23 @@ class Sources:
                 continue
             height = ((particles.position - self._at(valve.region, time, 0)) * self._at(valve.region, time, 1)).sum(1)
             out = (height > 1.0) & ~gone
-            record.removed[:, number] += particles.per_member(out.to(torch.int64), "sum")
+            if bool(out.any()):
+                self._account(particles.select(out), number, record, pressure)
             gone |= out
         return particles.select(~gone) if bool(gone.any()) else particles
+
+    def behind(self, position: Tensor, region: int, time: float) -> Tensor:
+        """(n,) bool: points (n, D) less than half a spacing before the plane of an orifice, or behind it."""
+        return ((position - self._at(region, time, 0)) * self._at(region, time, 1)).sum(1) > -0.5
+
+    def _account(
+        self, gone: Particles, valve: int, record: Record, pressure: Callable[[Particles], Tensor]
+    ) -> None:
+        """Note the particles that have left through a valve."""
+        energy = energy_unit(self.units, self._density, self.dimension)
+        record.removed[:, valve] += gone.per_member(torch.ones_like(gone.member), "sum")
+        record.outflow[:, valve] += gone.per_member(gone.mass.double(), "sum") * self.units.length**self.dimension
+        record.energy_out[:, valve] += gone.per_member(carried_energy(gone, pressure(gone)), "sum") * energy
 
     def _at(self, region: int, time: float, which: int) -> Tensor:
         """Centre (which 0, internal) or outward normal (1) of an orifice, linear in time between key frames."""

@@ -25,6 +25,13 @@ def tait_pressure(deviation: Tensor, sound_speed: float | Tensor, gamma: float |
     return sound_speed**2 / gamma * torch.expm1(gamma * torch.log1p(deviation))
 
 
+def tait_deviation(pressure: Tensor, sound_speed: float | Tensor, gamma: float | Tensor) -> Tensor:
+    """The deviation (N,) at which ``tait_pressure`` is ``pressure`` (N,)."""
+    if not isinstance(gamma, Tensor) and gamma == 1.0:
+        return pressure / sound_speed**2
+    return torch.expm1(torch.log1p(gamma * pressure / sound_speed**2) / gamma)
+
+
 def step_limits(
     speed: Tensor, acceleration: Tensor, smoothing_length: float | Tensor, sound_speed: float | Tensor,
     viscosity: float | Tensor, courant: float | Tensor,

@@ -24,6 +24,7 @@ constexpr int kBytes = 16, kCols = 4;
 #endif
 
 constexpr int kStrip = 128;  // columns factored at once
+constexpr int kGroup = 4;    // columns of a solve taken together: each entry of x is then fetched and stored once for four
 constexpr int kSweep = 512;  // columns of a solve between two meetings of the threads
 constexpr int64_t kWorthThreads = 1 << 22;  // entries of the band; with fewer the threads' meetings cost more
 constexpr int kPiece = 256;  // rows or columns of the rest that one thread updates at once: they fit its cache
@@ -180,27 +181,58 @@ int32_t factorise(const Band<T>& band) {
   return good;
 }
 
-// x[i] -= L(i, j) x[j] for the columns (start, stop) and rows (first, last)
+// x[i] -= L(i, j) x[j] for the columns (start, stop) and rows (first, last), kGroup columns in one pass over the rows
 template <typename T>
 void push(const Band<T>& band, int64_t start, int64_t stop, int64_t first, int64_t last, T* x) {
-  for (int64_t j = start; j < stop; ++j) {
-    const T* column = band.column(j);
-    const int64_t end = std::min(last, band.end(j));
-    const T value = x[j];
+  int64_t j = start;
+  for (; j + kGroup <= stop; j += kGroup) {
+    const T *a = band.column(j), *b = band.column(j + 1), *c = band.column(j + 2), *d = band.column(j + 3);
+    const T p = x[j], q = x[j + 1], r = x[j + 2], s = x[j + 3];
+    const int64_t end = std::max(first, std::min(last, band.end(j)));  // column j is the first to end
 #pragma omp simd
-    for (int64_t i = first; i < end; ++i) x[i] -= column[i] * value;
+    for (int64_t i = first; i < end; ++i) x[i] -= a[i] * p + b[i] * q + c[i] * r + d[i] * s;
+    for (int k = 1; k < kGroup; ++k)
+      for (int64_t i = end; i < std::min(last, band.end(j + k)); ++i) x[i] -= band.column(j + k)[i] * x[j + k];
+  }
+  for (; j < stop; ++j)
+    for (int64_t i = first; i < std::min(last, band.end(j)); ++i) x[i] -= band.column(j)[i] * x[j];
+}
+
+// x[j] -= sum of L(i, j) x[i] over the rows (first, last), for kGroup columns from j
+template <typename T>
+void pull(const Band<T>& band, int64_t j, int64_t first, int64_t last, T* x) {
+  const T *a = band.column(j), *b = band.column(j + 1), *c = band.column(j + 2), *d = band.column(j + 3);
+  const int64_t end = std::max(first, std::min(last, band.end(j)));
+  T p = 0, q = 0, r = 0, s = 0;
+#pragma omp simd reduction(+ : p, q, r, s)
+  for (int64_t i = first; i < end; ++i) {
+    p += a[i] * x[i];
+    q += b[i] * x[i];
+    r += c[i] * x[i];
+    s += d[i] * x[i];
+  }
+  const T sum[kGroup] = {p, q, r, s};
+  for (int k = 0; k < kGroup; ++k) {
+    T rest = sum[k];
+    for (int64_t i = end; i < std::min(last, band.end(j + k)); ++i) rest += band.column(j + k)[i] * x[i];
+    x[j + k] -= rest;
   }
 }
 
-// Sum of L(i, j) x[i] over the rows (first, last)
+// Columns (start, stop), at most kGroup, against their own triangle
 template <typename T>
-T pull(const Band<T>& band, int64_t j, int64_t first, int64_t last, const T* x) {
-  const T* column = band.column(j);
-  const int64_t end = std::min(last, band.end(j));
-  T sum = 0;
-#pragma omp simd reduction(+ : sum)
-  for (int64_t i = first; i < end; ++i) sum += column[i] * x[i];
-  return sum;
+void solve_triangle(const Band<T>& band, int64_t start, int64_t stop, bool lower, T* x) {
+  if (lower) {
+    for (int64_t j = start; j < stop; ++j) {
+      x[j] /= band.column(j)[j];
+      for (int64_t i = j + 1; i < std::min(stop, band.end(j)); ++i) x[i] -= band.column(j)[i] * x[j];
+    }
+    return;
+  }
+  for (int64_t j = stop - 1; j >= start; --j) {
+    for (int64_t i = j + 1; i < std::min(stop, band.end(j)); ++i) x[j] -= band.column(j)[i] * x[i];
+    x[j] /= band.column(j)[j];
+  }
 }
 
 // x (sides, count) in place: L x = right
@@ -212,9 +244,10 @@ void solve_lower(const Band<T>& band, int64_t sides, T* x) {
 #pragma omp for schedule(static)
     for (int64_t side = 0; side < sides; ++side) {
       T* own = x + side * band.count;
-      for (int64_t j = start; j < stop; ++j) {
-        own[j] /= band.column(j)[j];
-        push(band, j, j + 1, j + 1, stop, own);
+      for (int64_t j = start; j < stop; j += kGroup) {
+        const int64_t next = std::min(j + kGroup, stop);
+        solve_triangle(band, j, next, true, own);
+        push(band, j, next, next, stop, own);
       }
     }
 #pragma omp for schedule(static) collapse(2)
@@ -230,16 +263,19 @@ void solve_upper(const Band<T>& band, int64_t sides, T* x) {
 #pragma omp parallel if (band.count * band.width * sides > kWorthThreads)
   for (int64_t start = (band.count - 1) / kSweep * kSweep; start >= 0; start -= kSweep) {
     const int64_t stop = std::min<int64_t>(start + kSweep, band.count);
+    const int64_t groups = (stop - start) / kGroup, tail = start + groups * kGroup;  // a tail ends the matrix
 #pragma omp for schedule(static) collapse(2)
-    for (int64_t j = start; j < stop; ++j)
-      for (int64_t side = 0; side < sides; ++side) {
-        T* own = x + side * band.count;
-        own[j] -= pull(band, j, stop, band.count, own);
-      }
+    for (int64_t group = 0; group < groups; ++group)
+      for (int64_t side = 0; side < sides; ++side)
+        pull(band, start + group * kGroup, stop, band.count, x + side * band.count);
 #pragma omp for schedule(static)
     for (int64_t side = 0; side < sides; ++side) {
       T* own = x + side * band.count;
-      for (int64_t j = stop - 1; j >= start; --j) own[j] = (own[j] - pull(band, j, j + 1, stop, own)) / band.column(j)[j];
+      if (tail < stop) solve_triangle(band, tail, stop, false, own);
+      for (int64_t j = tail - kGroup; j >= start; j -= kGroup) {
+        pull(band, j, j + kGroup, stop, own);
+        solve_triangle(band, j, j + kGroup, false, own);
+      }
     }
   }
 }

@@ -28,9 +28,13 @@ constexpr int kRows = 4;              // tile rows held in registers
 constexpr int kCols = 2 * kWidth;     // tile columns: two vectors
 constexpr int kWorthThreads = 4096;   // rows: with fewer the threads' meetings cost more
 constexpr int kDepth = 32;            // points whose stencils are buffered before they are summed
+constexpr int kAhead = 16;             // rows whose targets are fetched before they are needed
 constexpr int kMaxComponents = 3;
 constexpr int kMaxAxes = 4;
 constexpr int kMaxOrder = 6;  // degree + 1
+
+// Inlined into a caller that knows the sizes at compile time, these small loops become straight vector code.
+#define SPLINE_INLINE inline __attribute__((always_inline))
 
 enum Kind : int32_t { kVector = 0, kDirection = 1, kDivergence = 2, kCellScalar = 3, kCellCoupled = 4 };
 
@@ -42,7 +46,7 @@ struct SplineGrid {
   int32_t axes, components, degree, padded;  // padded: local coefficients rounded up to the tile width
   int32_t axis_of_component[kMaxAxes];       // place of component k's own axis among the solve axes
   double spacing[kMaxAxes];                  // knot distance along the solve axes, m
-  double pieces[kMaxOrder * kMaxOrder];      // (degree + 1, degree + 1) powers of t of each basis function
+  double pieces[kMaxOrder * kMaxOrder];      // (degree + 1, degree + 1): row k holds the factors of t^k of each function
   int64_t cells, nodes;                      // cells that hold rows, active coefficients
   const int32_t* position;                   // (cells, local) solve positions, rising within a cell
 };
@@ -60,35 +64,47 @@ struct SplineRows {
 
 namespace {
 
-int local_size(const SplineGrid& g) {
-  int size = 1;
-  for (int a = 0; a < g.axes; ++a) size *= g.degree + 1;
-  return size;
-}
+constexpr int power(int base, int exponent) { return exponent == 0 ? 1 : base * power(base, exponent - 1); }
+
+int local_size(const SplineGrid& g) { return power(g.degree + 1, g.axes); }
+
+// Sizes known at compile time (all 0: read from the grid).
+template <int kAxes, int kDegree, int kComponents>
+struct Sizes {
+  static SPLINE_INLINE SplineGrid of(const SplineGrid& given) {
+    SplineGrid g = given;
+    if (kAxes) g.axes = kAxes, g.degree = kDegree, g.components = kComponents;
+    return g;
+  }
+  static SPLINE_INLINE int local(const SplineGrid& g) { return kAxes ? power(kDegree + 1, kAxes) : local_size(g); }
+};
 
 // 1-D basis values of one point, and their derivatives per metre.
 struct Basis {
   double value[kMaxAxes][kMaxOrder], slope[kMaxAxes][kMaxOrder];
 
-  Basis(const SplineGrid& g, const double* t, bool slopes) {
+  SPLINE_INLINE Basis(const SplineGrid& g, const double* t, bool slopes) {
     const int order = g.degree + 1;
     for (int a = 0; a < g.axes; ++a) {
-      for (int i = 0; i < order; ++i) {
-        const double* powers = g.pieces + i * order;
-        double v = 0, s = 0;
-        for (int k = order - 1; k >= 0; --k) {  // Horner for the polynomial and its derivative together
-          s = s * t[a] + v;
-          v = v * t[a] + powers[k];
+      double* v = value[a];
+      double* s = slope[a];
+      for (int i = 0; i < order; ++i) v[i] = g.pieces[(order - 1) * order + i], s[i] = 0;
+      for (int k = order - 2; k >= 0; --k) {  // Horner for the polynomials and their derivatives together
+        const double* power = g.pieces + k * order;
+#pragma omp simd
+        for (int i = 0; i < order; ++i) {
+          s[i] = s[i] * t[a] + v[i];
+          v[i] = v[i] * t[a] + power[i];
         }
-        value[a][i] = v;
-        if (slopes) slope[a][i] = s / g.spacing[a];
       }
+      if (slopes)
+        for (int i = 0; i < order; ++i) s[i] /= g.spacing[a];
     }
   }
 };
 
 // Products of 1-D values; the 1-D derivative on one axis (or -1 for none), times scale.
-void stencil(const SplineGrid& g, const Basis& basis, int derived, double scale, double* out) {
+SPLINE_INLINE void stencil(const SplineGrid& g, const Basis& basis, int derived, double scale, double* out) {
   const int order = g.degree + 1;
   out[0] = scale;
   int size = 1;
@@ -103,7 +119,8 @@ void stencil(const SplineGrid& g, const Basis& basis, int derived, double scale,
 }
 
 // The row of component k at point n, without the weight of kVector rows.
-void row_of(const SplineGrid& g, const SplineRows& rows, const Basis& basis, int64_t n, int k, double* out) {
+SPLINE_INLINE void row_of(const SplineGrid& g, const SplineRows& rows, const Basis& basis, int64_t n, int k,
+                          double* out) {
   const double* c = rows.coefficient + n * g.components;
   if (rows.kind == kVector) stencil(g, basis, -1, 1.0, out);
   else if (rows.kind == kDirection) stencil(g, basis, -1, c[k], out);
@@ -221,14 +238,14 @@ void scatter(const SplineGrid& g, int64_t cell_number, int local, CellGram& cell
   }
 }
 
-double dot(const double* a, const double* b, int count) {
+SPLINE_INLINE double dot(const double* a, const double* b, int count) {
   double sum = 0;
 #pragma omp simd reduction(+ : sum)
   for (int l = 0; l < count; ++l) sum += a[l] * b[l];
   return sum;
 }
 
-void add_scaled(const double* row, double scale, int count, double* out) {
+SPLINE_INLINE void add_scaled(const double* row, double scale, int count, double* out) {
 #pragma omp simd
   for (int l = 0; l < count; ++l) out[l] += scale * row[l];
 }
@@ -242,6 +259,44 @@ void gather(const SplineGrid& g, const int32_t* position, int local, const doubl
 void scatter_add(const SplineGrid& g, const int32_t* position, int local, const double* near, double* x) {
   for (int k = 0; k < g.components; ++k)
     for (int l = 0; l < local; ++l) x[int64_t(position[l]) * g.components + k] += near[k * local + l];
+}
+
+// What one cell's rows subtract from and add to its coefficients: pulled (components, local) += rows' (target - rows near).
+template <typename Size>
+void pull_cell(const SplineGrid& given, const SplineRows& rows, int64_t cell, const double* target, const int64_t* number,
+               const double* near, double* row, double* pulled) {
+  const SplineGrid g = Size::of(given);
+  const int local = Size::local(g), c = g.components;
+  const int width = rows.kind == kVector ? c : 1;  // targets of a row
+  for (int64_t n = rows.start[cell]; n < rows.start[cell + 1]; ++n) {
+    // the caller's order is any: its targets would be waited for
+    if (target && n + kAhead < rows.count) __builtin_prefetch(target + number[n + kAhead] * width);
+    const Basis basis(g, rows.t + n * g.axes, rows.kind == kDivergence);
+    if (rows.kind == kVector) {
+      stencil(g, basis, -1, 1.0, row);
+      for (int k = 0; k < c; ++k) {
+        const double weight = rows.coefficient[n * c + k];
+        const double fitted = near ? weight * dot(row, near + k * local, local) : 0.0;
+        const double goal = target ? target[number[n] * c + k] : 0.0;
+        add_scaled(row, weight * (goal - fitted), local, pulled + k * local);
+      }
+    } else {
+      for (int k = 0; k < c; ++k) row_of(g, rows, basis, n, k, row + k * local);
+      const double fitted = near ? dot(row, near, c * local) : 0.0;
+      add_scaled(row, (target ? target[number[n]] : 0.0) - fitted, c * local, pulled);
+    }
+  }
+}
+
+using PullCell = void (*)(const SplineGrid&, const SplineRows&, int64_t, const double*, const int64_t*, const double*,
+                          double*, double*);
+
+// The sizes in daily use, and any other.
+PullCell pull_cell_for(const SplineGrid& g) {
+  if (g.degree == 3 && g.axes == 3 && g.components == 3) return pull_cell<Sizes<3, 3, 3>>;
+  if (g.degree == 3 && g.axes == 2 && g.components == 2) return pull_cell<Sizes<2, 3, 2>>;
+  if (g.degree == 3 && g.axes == 4 && g.components == 3) return pull_cell<Sizes<4, 3, 3>>;
+  return pull_cell<Sizes<0, 0, 0>>;
 }
 
 }  // namespace
@@ -302,39 +357,34 @@ void spline_gram(const SplineGrid* grid, const SplineRows* blocks, int32_t block
 void spline_gradient(const SplineGrid* grid, const SplineRows* rows, const double* target, const int64_t* number,
                      const double* x, double* out) {
   const SplineGrid& g = *grid;
-  const int local = local_size(g), c = g.components;
-  const bool vector = rows->kind == kVector;
-  const int width = vector ? c : 1;  // targets per row
+  const int local = local_size(g);
+  const size_t size = size_t(local) * g.components;
+  const PullCell pull = pull_cell_for(g);
 #pragma omp parallel if (rows->count > kWorthThreads)
   {
-    std::vector<double> row(size_t(local) * c), near(size_t(local) * c), pulled(size_t(local) * c);
-    std::vector<double> mine(size_t(g.nodes) * c);
+    std::vector<double> row(size), near(size), pulled(size), mine(size_t(g.nodes) * g.components);
 #pragma omp for schedule(static)
     for (int64_t cell = 0; cell < g.cells; ++cell) {
       if (rows->start[cell] == rows->start[cell + 1]) continue;
-      if (x) gather(g, g.position + cell * local, local, x, near.data());
+      const int32_t* position = g.position + cell * local;
+      if (x) gather(g, position, local, x, near.data());
       std::fill(pulled.begin(), pulled.end(), 0.0);
-      for (int64_t n = rows->start[cell]; n < rows->start[cell + 1]; ++n) {
-        const Basis basis(g, rows->t + n * g.axes, rows->kind == kDivergence);
-        const double* goal = target ? target + number[n] * width : nullptr;
-        if (vector) {
-          stencil(g, basis, -1, 1.0, row.data());
-          for (int k = 0; k < c; ++k) {
-            const double weight = rows->coefficient[n * c + k];
-            const double fitted = x ? weight * dot(row.data(), near.data() + k * local, local) : 0.0;
-            add_scaled(row.data(), weight * ((goal ? goal[k] : 0.0) - fitted), local, pulled.data() + k * local);
-          }
-        } else {
-          for (int k = 0; k < c; ++k) row_of(g, *rows, basis, n, k, row.data() + k * local);
-          const double fitted = x ? dot(row.data(), near.data(), c * local) : 0.0;
-          add_scaled(row.data(), (goal ? goal[0] : 0.0) - fitted, c * local, pulled.data());
-        }
-      }
-      scatter_add(g, g.position + cell * local, local, pulled.data(), mine.data());
+      pull(g, *rows, cell, target, number, x ? near.data() : nullptr, row.data(), pulled.data());
+      scatter_add(g, position, local, pulled.data(), mine.data());
     }
 #pragma omp critical
     for (size_t i = 0; i < mine.size(); ++i) out[i] += mine[i];
   }
+}
+
+// Counting sort: number[place] is the row at each place when rows are sorted by their slot, equal ones in their order;
+// start (slots + 1) the first place of each slot.
+void spline_sort(const int64_t* slot, int64_t count, int64_t slots, int64_t* number, int64_t* start) {
+  std::fill_n(start, slots + 1, 0);
+  for (int64_t n = 0; n < count; ++n) ++start[slot[n] + 1];
+  for (int64_t s = 0; s < slots; ++s) start[s + 1] += start[s];
+  std::vector<int64_t> next(start, start + slots);
+  for (int64_t n = 0; n < count; ++n) number[next[slot[n]]++] = n;
 }
 
 }  // extern "C"

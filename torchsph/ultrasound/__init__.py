@@ -7,21 +7,16 @@ alone: no estimator imports the simulator. Measurements join the two on a record
 from .acquisition import Acquisition, Beams, Packet
 from .calibration import Calibration, fit_calibration
 from .clutter import ClutterFilter, FIRFilter, PolynomialFilter, SVDFilter
-from .doppler import (
-    ColourDoppler,
-    DopplerEstimates,
-    DopplerOptions,
-    colour_doppler,
-    measure_doppler,
-    vector_doppler,
-)
+from .doppler import ColourDoppler, DopplerEstimates, colour_doppler, vector_doppler
+from .doppler_measurement import DopplerOptions, measure_doppler
 from .echoes import EchoModel, simulate_packet
+from .estimates import Estimates, Flag
 from .flow import Flow, LinearFlow, RecordingFlow
 from .noise import NoiseModel, measure_noise
 from .plugin import LibraryTracker, Tracker
-from .pointspread import GaussianPointSpread, PointSpread, SampledPointSpread
-from .speckle import SpeckleOptions, measure_speckle
-from .tracking import Estimates, Flag, SpeckleTracker, track
+from .pointspread import GaussianPointSpread, PointSpread, SampledPointSpread, SectorPointSpread
+from .speckle_measurement import SpeckleOptions, measure_speckle
+from .tracking import SpeckleTracker, track
 from .training import SwirlFlow, TrainingPlan, calibrate, random_swirl
 from .uff import UffVolumes, read_uff, write_uff
 
@@ -48,6 +43,7 @@ __all__ = [
     "RecordingFlow",
     "SVDFilter",
     "SampledPointSpread",
+    "SectorPointSpread",
     "SpeckleOptions",
     "SpeckleTracker",
     "SwirlFlow",

@@ -50,8 +50,7 @@ class Acquisition:
 
 @dataclass(frozen=True)
 class Beams:
-    """Where the beams point: parallel along ``direction``, or fanning out from ``apex`` (then it is not
-    used).
+    """Where the beams point: parallel along ``direction``, or fanning out from ``apex`` on both sides of it.
 
     direction: D numbers, made a unit vector, in which sound leaves the probe. apex: D numbers, m.
     """
@@ -70,6 +69,11 @@ class Beams:
     @property
     def dimension(self) -> int:
         return len(self.direction)
+
+    def across(self) -> tuple[tuple[float, ...], ...]:
+        """D - 1 unit vectors at right angles to the direction and to each other."""
+        frame = torch.cat([torch.tensor([self.direction]).double().T, torch.eye(self.dimension).double()], 1)
+        return tuple(map(tuple, torch.linalg.qr(frame)[0].T[1:].tolist()))
 
     def depth(self, points: Tensor) -> Tensor:
         """One-way path (n,), m, from the probe to points (n, D), up to a constant for parallel beams."""

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .tracking import Estimates
+from .estimates import Estimates
 
 RIDGE = 1e-2  # pulls coefficients that the data leave open to zero, in units of one observation
 GROUPS = 8  # of training errors, by predicted deviation
@@ -149,9 +149,3 @@ def _rising_knots(score: np.ndarray, square: np.ndarray) -> tuple[tuple[float, f
                 ]
             )
     return tuple((place, math.log(max(level, LEAST_VARIANCE))) for place, level, _ in pools)
-
-
-def joined(parts: list[Estimates]) -> Estimates:
-    """Estimates of several packets as one."""
-    names = Estimates.__dataclass_fields__
-    return Estimates(**{name: torch.cat([getattr(part, name) for part in parts]) for name in names})

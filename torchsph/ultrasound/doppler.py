@@ -7,17 +7,14 @@ The lag-one autocorrelation of Kasai et al. (IEEE Trans. Sonics Ultrason. 32, 19
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
 
-from geometry import Recording
-
-from .acquisition import Beams, Packet
+from .acquisition import Packet
 from .clutter import ClutterFilter, FIRFilter
-from .fields import convolve_axis
-from .measurement import Canvas, ScannerOptions, scanned
+from .fields import box_sum
 
 
 @dataclass(frozen=True)
@@ -69,7 +66,7 @@ def colour_doppler(packet: Packet, points: Tensor, options: ColourDoppler) -> Do
     sums = torch.stack([first.real, first.imag, power, finite.to(power)])
     for number, step in enumerate(packet.grid.spacing):
         nodes = 2 * round(options.window / (2 * step)) + 1
-        sums = convolve_axis(sums, sums.new_ones(nodes), -1 - number, padded=True)
+        sums = box_sum(sums, nodes, sums.dim() - 1 - number)
     real, imaginary, power, count = sums[(slice(None), *place.unbind(1))]
     coherence = (torch.hypot(real, imaginary) / power.clamp_min(torch.finfo(power.dtype).tiny)).clamp(0, 1)
     per_radian = packet.acquisition.prf / packet.acquisition.phase_per_metre
@@ -98,70 +95,3 @@ def vector_doppler(beams: Tensor, speeds: Tensor, sigmas: Tensor) -> tuple[Tenso
     right = torch.einsum("nm,ma,mn->na", weight, beams.to(speeds), speeds)
     covariance = torch.linalg.inv(normal)
     return (covariance @ right[..., None])[..., 0], covariance.diagonal(dim1=1, dim2=2).sqrt()
-
-
-@dataclass(frozen=True)
-class DopplerOptions(ScannerOptions):
-    """Options of :func:`measure_doppler`: a scanner and an averaging ``window``, m.
-
-    steering: ``None`` for colour Doppler along one beam; an angle in degrees for vector Doppler from beams
-    tilted by it to both sides along every lateral axis.
-    """
-
-    window: float = 1e-3
-    steering: float | None = None
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        ColourDoppler(self.window)
-        if self.steering is not None and not 0 < self.steering < 80:
-            raise ValueError(f"steering must lie between 0 and 80 degrees, got {self.steering!r}")
-
-    def directions(self, dimension: int) -> list[tuple[float, ...]]:
-        """Unit vectors of the beams."""
-        centre = torch.tensor(self.echo_model(dimension).beams.direction, dtype=torch.float64)
-        if self.steering is None:
-            return [tuple(centre.tolist())]
-        # an orthonormal frame whose first vector is the central beam
-        frame = torch.linalg.qr(torch.cat([centre[:, None], torch.eye(dimension, dtype=torch.float64)], 1))[0]
-        tilt = math.radians(self.steering)
-        sides = [sign * frame[:, axis] for axis in range(1, dimension) for sign in (-1, 1)]
-        return [tuple((math.cos(tilt) * centre + math.sin(tilt) * side).tolist()) for side in sides]
-
-
-def measure_doppler(
-    true: Recording, options: DopplerOptions, seed: int, *, progress: bool = False
-) -> Recording:
-    """What a scanner's Doppler reports of ``true``: every K-th frame, with ``weight`` (coherence) and
-    ``sigma``.
-
-    Colour Doppler gives a recording with ``beam``, its velocity (v . b) b; vector Doppler one of full
-    vectors.
-    """
-    base = options.echo_model(true.dimension)
-    directions = options.directions(true.dimension)
-    models = [replace(base, beams=Beams(direction)) for direction in directions]
-    doppler = ColourDoppler(options.window, options.filter())
-    canvas = Canvas(true, list(range(0, true.frames, options.every)))
-    for frame, points, packets in scanned(true, options, models, seed, options.window, progress=progress):
-        if not packets:
-            continue
-        found = [colour_doppler(packet, points, doppler) for packet in packets]
-        beams = torch.tensor(directions, dtype=found[0].speed.dtype, device=found[0].speed.device)
-        if options.steering is None:
-            velocity, sigma = (
-                found[0].speed[:, None] * beams,
-                found[0].sigma[:, None].expand(-1, true.dimension),
-            )
-        else:
-            velocity, sigma = vector_doppler(
-                beams, torch.stack([f.speed for f in found]), torch.stack([f.sigma for f in found])
-            )
-        accepted = torch.stack([f.accepted for f in found]).all(0)
-        coherence = torch.stack([f.coherence for f in found]).amin(0)
-        canvas.paint(frame, velocity, sigma, torch.where(accepted, coherence, 0))
-    kind = "colour Doppler" if options.steering is None else f"vector Doppler, {options.steering:g} degrees"
-    return canvas.recording(
-        f"{kind} of simulated echoes, {options.summary()}, window {options.window * 1e3:g} mm, seed {seed}",
-        directions[0] if options.steering is None else None,
-    )

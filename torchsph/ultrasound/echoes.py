@@ -11,25 +11,27 @@ from geometry import Grid
 
 from .acquisition import Acquisition, Beams, Packet
 from .flow import Flow
-from .image import ParallelImager
-from .pointspread import GaussianPointSpread, PointSpread
+from .image import Imager, ParallelImager
+from .pointspread import GaussianPointSpread, PointSpread, SectorPointSpread
 from .scatterers import Box, Cloud, carry, reseed, seed_cloud
+from .sector import SectorImager
 
 
 @dataclass(frozen=True)
 class EchoModel:
     """Options of :func:`simulate_packet`.
 
+    pointspread: a :class:`SectorPointSpread` for beams from an apex, any other for parallel ones.
     snr: blood speckle power over thermal noise power, dB; ``None`` = no noise.
     tissue: echogenicity of tissue over blood, dB; ``None`` = tissue is silent.
     clutter: stationary echo power over blood power inside the blood (reverberation, side lobes), dB;
         ``None`` = none. ``clutter_velocity``, m/s, lets it move (D numbers, ``None`` = still).
-    density: scatterers per volume sqrt-integral of the point spread; 5 with
-        Gaussian amplitudes give fully developed speckle.
+    density: scatterers per integral of the point spread's square. The intensity's normalised second moment
+        is then above that of fully developed speckle, 2, by about 0.35 / density in space (0.5 in a plane).
     """
 
     acquisition: Acquisition = Acquisition()
-    pointspread: PointSpread = field(default_factory=GaussianPointSpread)
+    pointspread: PointSpread | SectorPointSpread = field(default_factory=GaussianPointSpread)
     beams: Beams = Beams()
     snr: float | None = 20.0
     tissue: float | None = 40.0
@@ -42,6 +44,8 @@ class EchoModel:
             value = getattr(self, name)
             if value is not None and not math.isfinite(value):
                 raise ValueError(f"{name} must be a finite number of dB or None, got {value!r}")
+        if isinstance(self.pointspread, SectorPointSpread) != (self.beams.apex is not None):
+            raise ValueError("beams from an apex need a SectorPointSpread, and parallel beams another one")
         if not (math.isfinite(self.density) and self.density > 0):
             raise ValueError(f"density must be positive, got {self.density!r}")
 
@@ -58,23 +62,22 @@ def simulate_packet(
     if model.beams.dimension != grid.dimension:
         raise ValueError(f"beams are {model.beams.dimension}-D, the grid {grid.dimension}-D")
     acquisition = model.acquisition
-    imager = ParallelImager(
-        grid, model.pointspread, acquisition, model.beams, dtype=dtype, device=generator.device
-    )
-    box, density = _box(grid, model), model.density / model.pointspread.energy(grid.dimension)
+    imager, box = make_imager(grid, model, dtype, generator.device), _box(grid, model)
+    energy = torch.as_tensor(imager.energy)
+    density = model.density / float(energy.min())  # where the point spread is smallest
     start = time - 0.5 * (acquisition.packet - 1) * acquisition.interval
     cloud = seed_cloud(box, flow, start, density, generator, dtype=dtype)
     haze = None if model.clutter is None else seed_cloud(box, flow, start, density, generator, dtype=dtype)
-    # density * energy(h) is the speckle power of unit amplitudes, so this makes the blood's power 1
-    scale = 1 / math.sqrt(density * model.pointspread.energy(grid.dimension))
+    # density * energy is the speckle power of unit amplitudes, so this makes the blood's power 1 everywhere
+    scale = 1 / (density * energy).sqrt()
     noise = 0.0 if model.snr is None else 10 ** (-model.snr / 10)
     images = []
     for number in range(acquisition.packet):
         now = start + number * acquisition.interval
-        iq = imager.image(cloud.position, _echogenicity(cloud, model) * scale)
+        iq = imager.image(cloud.position, _echogenicity(cloud, model)) * scale
         if haze is not None:
             shift = haze.position.new_tensor(model.clutter_velocity or (0.0,) * grid.dimension) * (now - time)
-            iq += imager.image(haze.position + shift, haze.amplitude * (scale * 10 ** (model.clutter / 20)))
+            iq += imager.image(haze.position + shift, haze.amplitude * 10 ** (model.clutter / 20)) * scale
         if noise:
             iq += math.sqrt(noise) * imager.noise(generator)
         images.append(iq)
@@ -84,9 +87,23 @@ def simulate_packet(
     return Packet(torch.stack(images), grid, acquisition, model.beams, noise)
 
 
+def make_imager(
+    grid: Grid, model: EchoModel, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu"
+) -> Imager:
+    """The imager for the model's beams."""
+    kind = ParallelImager if model.beams.apex is None else SectorImager
+    return kind(grid, model.pointspread, model.acquisition, model.beams, dtype=dtype, device=device)
+
+
 def _box(grid: Grid, model: EchoModel) -> Box:
     """The grid's box and what lies within reach of the point spread around it."""
-    reach = model.pointspread.reach(model.beams.direction)
+    if isinstance(model.pointspread, SectorPointSpread):
+        # as for parallel beams of the farthest corner's width, whatever their direction
+        farthest, spread = float(model.beams.depth(grid.nodes()).max()), model.pointspread
+        widest = GaussianPointSpread(spread.axial, spread.lateral * farthest / spread.depth)
+        reach = (max(widest.reach(model.beams.direction)),) * grid.dimension
+    else:
+        reach = model.pointspread.reach(model.beams.direction)
     lower = tuple(a - r for a, r in zip(grid.origin, reach, strict=True))
     return Box(lower, tuple(b + r for b, r in zip(grid.upper, reach, strict=True)))
 

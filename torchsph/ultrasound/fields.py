@@ -34,6 +34,27 @@ def convolve_axis(field: Tensor, kernel: Tensor, axis: int, *, padded: bool) -> 
     return rows.reshape(*moved.shape[:-1], rows.shape[-1]).movedim(-1, axis)
 
 
+def box_sum(field: Tensor, nodes: int, axis: int) -> Tensor:
+    """Sums over windows of ``nodes`` (odd) nodes along one axis, zeros outside; real or complex.
+
+    Windows of 1, 2, 4, ... nodes by doubling, joined: additions alone, and log2(nodes) of them.
+    """
+    size = field.shape[axis]
+    edge = list(field.shape)
+    edge[axis] = nodes // 2
+    run, width, start, total = torch.cat([field.new_zeros(edge), field, field.new_zeros(edge)], axis), 1, 0, None
+    while nodes:
+        if nodes & 1:
+            part = run.narrow(axis, start, size)
+            total = part.clone() if total is None else total.add_(part)
+            start += width
+        nodes >>= 1
+        if nodes:
+            rest = run.shape[axis] - width
+            run, width = run.narrow(axis, 0, rest) + run.narrow(axis, width, rest), 2 * width
+    return total
+
+
 def masked_blur(field: Tensor, mask: Tensor, deviation: float, spacing: tuple[float, ...]) -> Tensor:
     """Gaussian average of ``field`` (C, *shape) over the nodes of ``mask`` (*shape) only; 0 outside the mask.
 

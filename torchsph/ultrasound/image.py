@@ -6,7 +6,9 @@ scatterers' Fourier transform times that of the point-spread function. Single sc
 
 from __future__ import annotations
 
+import cmath
 import math
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -14,10 +16,27 @@ from torch import Tensor
 from geometry import Grid
 
 from .acquisition import Acquisition, Beams
-from .gridding import Gridding, fast_length
+from .convolution import Convolution
+from .gridding import fast_length
 from .pointspread import PointSpread
 
-OVERSAMPLING = 1.5
+
+class Imager(Protocol):
+    """Forms images on a grid.
+
+    energy: integral of |h|^2, m^D, over the scatterers' positions, a number or one for each node: the power
+    that one scatterer of power 1 per m^D gives on average.
+    """
+
+    energy: float | Tensor
+
+    def image(self, points: Tensor, amplitude: Tensor) -> Tensor:
+        """IQ (*shape) of scatterers at ``points`` (n, D), m, with complex ``amplitude`` (n,)."""
+        ...
+
+    def noise(self, generator: torch.Generator) -> Tensor:
+        """Circular Gaussian noise (*shape) of power 1 in the band of the point-spread function."""
+        ...
 
 
 class ParallelImager:
@@ -34,37 +53,19 @@ class ParallelImager:
         if beams.apex is not None:
             raise ValueError("ParallelImager needs parallel beams; use SectorImager for beams from an apex")
         self.grid, self.acquisition, self.beams = grid, acquisition, beams
+        self.energy = pointspread.energy(grid.dimension)
         reach = pointspread.reach(beams.direction)
         pad = [math.ceil(r / s) for r, s in zip(reach, grid.spacing, strict=True)]
         self._pad = tuple(reversed(pad))
         self._padded = tuple(fast_length(n + 2 * p) for n, p in zip(grid.shape, self._pad, strict=True))
-        box = [n * s for n, s in zip(reversed(self._padded), grid.spacing, strict=True)]
-        nodes = [
-            fast_length(max(math.ceil(OVERSAMPLING * band * length / math.pi), 2 * width))
-            for band, length in zip(pointspread.band(beams.direction), box, strict=True)
-        ]
-        self.lattice = Gridding(
-            tuple(o - p * s for o, p, s in zip(grid.origin, pad, grid.spacing, strict=True)),
-            tuple(length / n for length, n in zip(box, nodes, strict=True)),
-            tuple(reversed(nodes)), width, OVERSAMPLING,
-        )  # fmt: skip
         self._lower = torch.tensor(grid.origin, dtype=dtype, device=device)
         self._reach = torch.tensor(reach, dtype=dtype, device=device)
         self._upper = torch.tensor(grid.upper, dtype=dtype, device=device)
-        self._window, self._colour = self._make_windows(pointspread, math.prod(box))
-
-    def _make_windows(self, pointspread: PointSpread, volume: float) -> tuple[Tensor, Tensor]:
-        """Point-spread transform over the gridding kernel's, and the colour of noise of power 1."""
-        dimension = self.grid.dimension
-        waves, spread = [], torch.ones((), dtype=self._lower.dtype, device=self._lower.device)
-        for axis in range(dimension):
-            view = [1] * dimension
-            view[dimension - 1 - axis] = -1
-            waves.append(self.lattice.wavenumbers(axis, self._lower).view(view))
-            spread = spread * self.lattice.correction(axis, self._lower).view(view)
-        transform = pointspread.transform(waves, self.beams.direction)
-        colour = transform.abs()
-        return transform / (spread * volume), colour / colour.square().sum().sqrt()
+        self._convolution = Convolution(
+            tuple(o - p * s for o, p, s in zip(grid.origin, pad, grid.spacing, strict=True)),
+            tuple(n * s for n, s in zip(reversed(self._padded), grid.spacing, strict=True)),
+            pointspread, beams.direction, width=width, like=self._lower,
+        )  # fmt: skip
 
     def image(self, points: Tensor, amplitude: Tensor) -> Tensor:
         """IQ (*shape) of scatterers at ``points`` (n, D), m, with complex ``amplitude`` (n,).
@@ -75,27 +76,17 @@ class ParallelImager:
         points, amplitude = points[near], amplitude[near]
         # depth from the grid's corner keeps the phase small, and so exact in float32; then one common factor
         phase = -self.acquisition.phase_per_metre * self.beams.depth(points - self._lower)
-        spectrum = torch.fft.fftn(
-            self.lattice.spread(points, amplitude * torch.polar(torch.ones_like(phase), phase))
-        )
+        series = self._convolution.series(points, amplitude * torch.polar(torch.ones_like(phase), phase))
         corner = sum(o * b for o, b in zip(self.grid.origin, self.beams.direction, strict=True))
-        common = -self.acquisition.phase_per_metre * corner
-        return self._render(spectrum * self._window) * complex(math.cos(common), math.sin(common))
+        return self._render(series) * cmath.exp(-1j * self.acquisition.phase_per_metre * corner)
 
     def noise(self, generator: torch.Generator) -> Tensor:
-        """Circular Gaussian noise (*shape) of power 1 in the band of the point-spread function.
+        """Noise (*shape) of power 1, see :meth:`Convolution.noise`."""
+        return self._render(self._convolution.noise(generator))
 
-        White receiver noise that has gone through the same filter and beamformer as the echoes: the least
-        favourable colour, since no further filter can separate the two.
-        """
-        like = self._colour
-        white = torch.randn((*like.shape, 2), generator=generator, dtype=like.dtype, device=like.device)
-        return self._render(torch.view_as_complex(white) * (like / math.sqrt(2)))
-
-    def _render(self, spectrum: Tensor) -> Tensor:
+    def _render(self, series: Tensor) -> Tensor:
         """Evaluate a Fourier series (*lattice) on the grid's nodes."""
-        resized = resize_spectrum(spectrum, self._padded)
-        image = torch.fft.ifftn(resized, norm="forward")
+        image = torch.fft.ifftn(resize_spectrum(series, self._padded), norm="forward")
         for axis, (pad, nodes) in enumerate(zip(self._pad, self.grid.shape, strict=True)):
             image = image.narrow(axis, pad, nodes)
         return image.contiguous()

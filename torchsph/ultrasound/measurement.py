@@ -18,7 +18,7 @@ from .clutter import ClutterFilter, FIRFilter, PolynomialFilter, SVDFilter
 from .echoes import EchoModel, simulate_packet
 from .flow import RecordingFlow
 from .noise import frame_seed
-from .pointspread import GaussianPointSpread
+from .pointspread import GaussianPointSpread, SectorPointSpread
 
 FILTERS = {"fir": FIRFilter, "polynomial": PolynomialFilter, "svd": SVDFilter, "none": None}
 
@@ -31,7 +31,9 @@ class ScannerOptions:
     the blood. clutter: still echoes over blood, within it; ``None`` = none. frequency, sound_speed, prf,
     packet: see :class:`Acquisition`. axial_width, lateral_width: FWHM of the point spread. image_spacing:
     between samples of the image (made to divide the recording's spacing). clutter_filter: fir, polynomial,
-    svd or none. beam: direction of the beams, x, y, z; ``None`` = along the last axis. device: for torch.
+    svd or none. beam: direction of the beams, x, y, z; ``None`` = along the last axis. apex: of a sector, from
+    which the beams fan out around ``beam``, x, y, z, m, ``None`` = parallel beams; the lateral width is then
+    that at ``depth`` and grows with it. device: for torch.
     """
 
     every: int = 1
@@ -47,6 +49,8 @@ class ScannerOptions:
     image_spacing: float = 1e-3 / 6
     clutter_filter: str = "fir"
     beam: tuple[float, ...] | None = None
+    apex: tuple[float, ...] | None = None
+    depth: float = 50e-3
     device: str = "cpu"
 
     def __post_init__(self) -> None:
@@ -58,7 +62,10 @@ class ScannerOptions:
             raise ValueError(
                 f"clutter_filter must be one of {', '.join(FILTERS)}, got {self.clutter_filter!r}"
             )
-        self.echo_model(3 if self.beam is None else len(self.beam))  # its parts check the rest
+        for name in ("beam", "apex"):
+            if getattr(self, name) is not None:
+                object.__setattr__(self, name, tuple(float(part) for part in getattr(self, name)))
+        self.echo_model(len(self.beam or self.apex or (0,) * 3))  # its parts check the rest
         filtering = self.filter()
         if filtering is not None:
             filtering.apply(
@@ -80,10 +87,12 @@ class ScannerOptions:
         direction = self.beam or (0.0,) * (dimension - 1) + (1.0,)
         if len(direction) != dimension:
             raise ValueError(f"beam has {len(direction)} components, the recording {dimension}")
+        shape = GaussianPointSpread(self.axial_width, self.lateral_width)
+        if self.apex is not None:
+            shape = SectorPointSpread(self.axial_width, self.lateral_width, self.depth)
         return EchoModel(
             Acquisition(self.frequency, self.sound_speed, self.prf, self.packet),
-            GaussianPointSpread(self.axial_width, self.lateral_width), Beams(direction),
-            self.snr, self.tissue, self.clutter,
+            shape, Beams(direction, self.apex), self.snr, self.tissue, self.clutter,
         )  # fmt: skip
 
     def spacing(self, grid: Grid) -> tuple[float, ...]:
@@ -151,13 +160,12 @@ class Canvas:
         self.sigma[row][:, mask] = sigma.cpu().T.numpy()
         self.weight[row][mask] = weight.cpu().numpy()
 
-    def recording(self, description: str, beam: tuple[float, ...] | None = None) -> Recording:
+    def recording(self, description: str, beams: Beams | None = None) -> Recording:
+        """The measurement; with ``beams``, one of the velocity along them alone."""
         base = self.true.select(self.frames).with_velocity(
             self.velocity, sigma=self.sigma, description=description
         )
-        if beam is None:
+        if beams is None:
             return replace(base, weight=self.weight)
-        field = np.broadcast_to(
-            np.reshape(beam, (-1, *[1] * len(self.true.grid.shape))), self.velocity.shape[1:]
-        )
-        return replace(base, weight=self.weight, beam=field)
+        along = beams.directions(self.true.grid.nodes()).T.numpy()
+        return replace(base, weight=self.weight, beam=along.reshape(-1, *self.true.grid.shape))

@@ -2,7 +2,7 @@
 
 The model has the traits that a tracker's errors have and white noise lacks: they are correlated over the
 tracking kernel, grow with shear, blur the flow, lose slow axial flow to the clutter filter and hop to
-false peaks. It is meant for sweeps over noise level and frame rate; :mod:`torchsph.ultrasound.speckle`
+false peaks. It is meant for sweeps over noise level and frame rate; :mod:`torchsph.ultrasound.speckle_measurement`
 goes through simulated echoes.
 """
 

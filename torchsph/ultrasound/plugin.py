@@ -30,7 +30,7 @@ from torch import Tensor
 
 from .acquisition import Packet
 from .clutter import ClutterFilter
-from .tracking import Estimates, Flag
+from .estimates import Estimates, Flag
 
 
 class Tracker(Protocol):

@@ -81,14 +81,33 @@ class GaussianPointSpread:
         return tuple(BAND * math.sqrt(float(v)) for v in self._covariance(direction).inverse().diagonal())
 
 
+@dataclass(frozen=True)
+class SectorPointSpread:
+    """Gaussian envelope of beams from an apex: ``lateral`` m across at ``depth`` m, in proportion to the depth
+    elsewhere, and ``axial`` m along the beam. Widths as in :class:`GaussianPointSpread`."""
+
+    axial: float = 0.5e-3
+    lateral: float = 1.2e-3
+    depth: float = 50e-3
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.depth) and self.depth > 0):
+            raise ValueError(f"depth must be positive and finite, got {self.depth!r}")
+        self.in_beam_coordinates()
+
+    def in_beam_coordinates(self) -> GaussianPointSpread:
+        """The same in direction cosines across and metres along."""
+        return GaussianPointSpread(self.axial, self.lateral / self.depth)
+
+
 @dataclass(frozen=True, eq=False)
 class SampledPointSpread:
     """A point-spread function given as an array: ``values`` (*shape) complex baseband samples, ``spacing``
     x, y, z.
 
-    The middle node (shape // 2) is the scatterer's position. The array's axes are those of the image; the
-    beam's direction does not turn it. The samples must resolve the function (|h| small at the Nyquist
-    frequency).
+    The array is scaled to a peak of 1. Its middle node (shape // 2) is the scatterer's position, and its axes
+    are those of the image: the beam's direction does not turn it. The samples must resolve the function (|h|
+    small at the Nyquist frequency).
     """
 
     values: Tensor
@@ -99,6 +118,9 @@ class SampledPointSpread:
             raise ValueError(f"a {self.values.dim()}-D point spread cannot have spacing {self.spacing!r}")
         if not torch.isfinite(torch.view_as_real(self.values.to(torch.complex64))).all():
             raise ValueError("the point-spread array holds NaN or infinity")
+        if not self.values.abs().max() > 0:
+            raise ValueError("the point-spread array holds nothing but zeros")
+        object.__setattr__(self, "values", self.values / self.values.abs().max())
 
     def transform(self, wavenumbers: list[Tensor], direction: tuple[float, ...]) -> Tensor:
         total = self.values.to(torch.complex128)

@@ -51,7 +51,7 @@ def seed_cloud(
     box: Box, flow: Flow, time: float, density: float, generator: torch.Generator,
     *, dtype: torch.dtype = torch.float32,
 ) -> Cloud:  # fmt: skip
-    """Scatterers uniformly at random in ``box``, ``density`` per m^D, with circular Gaussian amplitudes."""
+    """Scatterers uniformly at random in ``box``, ``density`` per m^D, of power 1 and random phase."""
     if not density > 0:
         raise ValueError(f"scatterer density must be positive (per m^D), got {density!r}")
     count = max(1, round(density * box.volume))
@@ -132,8 +132,9 @@ def _uniform(box: Box, count: int, generator: torch.Generator, dtype: torch.dtyp
 
 
 def _amplitudes(count: int, generator: torch.Generator, dtype: torch.dtype) -> Tensor:
-    parts = torch.randn((count, 2), generator=generator, dtype=dtype, device=generator.device)
-    return torch.view_as_complex(parts * math.sqrt(0.5))
+    """Of one strength and any phase: fewer make speckle fully developed than if strengths varied too."""
+    phase = 2 * math.pi * torch.rand(count, generator=generator, dtype=dtype, device=generator.device)
+    return torch.polar(torch.ones_like(phase), phase)
 
 
 def _cell_number(position: Tensor, box: Box, cells: list[int]) -> Tensor:

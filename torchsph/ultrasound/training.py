@@ -10,8 +10,9 @@ from torch import Tensor
 
 from geometry import Grid
 
-from .calibration import Calibration, fit_calibration, joined
+from .calibration import Calibration, fit_calibration
 from .echoes import EchoModel, simulate_packet
+from .estimates import Estimates
 from .tracking import SpeckleTracker
 
 
@@ -111,15 +112,18 @@ def training_points(plan: TrainingPlan, centre: tuple[float, ...]) -> Tensor:
 
 def calibrate(
     model: EchoModel, tracker: SpeckleTracker, spacing: tuple[float, ...], generator: torch.Generator,
-    plan: TrainingPlan = TrainingPlan(),
+    plan: TrainingPlan = TrainingPlan(), *, centre: tuple[float, ...] | None = None,
 ) -> Calibration:  # fmt: skip
-    """Fit deviations and weights of ``tracker`` on random swirls; image ``spacing`` x, y, z, m."""
-    centre = (0.0,) * len(spacing)
+    """Fit deviations and weights of ``tracker`` on random swirls; image ``spacing`` x, y, z, m.
+
+    centre: of the swirls, m, where beams from an apex make the place matter; ``None`` = the origin.
+    """
+    centre = centre or (0.0,) * len(spacing)
     reach = plan.radius + plan.margin
     # symmetric about the middle, so that the points to track fall on image nodes whenever step is a multiple
     sides = [math.ceil(reach / s) for s in spacing]
     grid = Grid(
-        tuple(-n * s for n, s in zip(sides, spacing, strict=True)),
+        tuple(c - n * s for c, n, s in zip(centre, sides, spacing, strict=True)),
         spacing,
         tuple(2 * n + 1 for n in reversed(sides)),
     )
@@ -133,4 +137,4 @@ def calibrate(
         parts.append(estimates)
         errors.append(estimates.velocity - flow.velocity(points, 0.0).to(estimates.velocity))
     beam = model.beams.directions(torch.cat([points] * plan.simulations)).to(errors[0])
-    return fit_calibration(joined(parts), torch.cat(errors), beam)
+    return fit_calibration(Estimates.joined(parts), torch.cat(errors), beam)

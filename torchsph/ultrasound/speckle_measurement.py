@@ -50,7 +50,8 @@ def measure_speckle(
     model, tracker = options.echo_model(true.dimension), options.tracker()
     spacing = options.spacing(true.grid)
     generator = torch.Generator(options.device).manual_seed(frame_seed(seed, TRAINING))
-    calibration = calibrate(model, tracker, spacing, generator, options.plan())
+    middle = tuple(0.5 * (a + b) for a, b in zip(true.grid.origin, true.grid.upper, strict=True))
+    calibration = calibrate(model, tracker, spacing, generator, options.plan(), centre=middle)
     canvas = Canvas(true, list(range(0, true.frames, options.every)))
     # the kernel, the way to the end of the search, and a node to spare
     margin = 0.5 * options.kernel + options.search / options.prf + 2 * max(spacing)
