@@ -162,6 +162,11 @@ class Domain:
         """Present time, s, on the average over the members."""
         return float(self._times.mean())
 
+    def later(self, particles: Particles, step: Tensor) -> Particles:
+        """Go on by ``step`` (members,), internal; the particles with what buffers do at that time."""
+        self.at(self.member_times(particles.members) + step.double() * self.units.time)
+        return self.reservoirs.driven(particles) if self.reservoirs is not None and self._open else particles
+
     def time_of(self, particles: Particles) -> Tensor:
         """Present time of each particle's member, s, (N,) float64."""
         return self.member_times(particles.members).index_select(0, particles.member)
@@ -198,6 +203,10 @@ class Domain:
         if push is None or total is None:
             return total if push is None else push
         return total + push
+
+    def shortfall(self, particles: Particles) -> Tensor:
+        """By how much (N,), per time, the volume of a member's particles should grow to fill the cavity."""
+        return per_particle(self.reservoirs.shortfall(particles), particles.member)
 
     def _gravity(self, particles: Particles) -> Tensor | None:
         """Gravity at the particles' present times (N, D) or None."""
@@ -245,7 +254,7 @@ class Domain:
         which is far below a spacing, so that one look-up per step does.
         """
         if self.reservoirs is not None and self._open:
-            after = self.reservoirs.driven(after, step)
+            after = self.reservoirs.driven(after)
         if wall is None or not isinstance(self.scheme.wall, CompleteKernelWall):
             return after
         dt = per_particle(step, after.member)
@@ -321,7 +330,7 @@ class Domain:
         else:
             points = particles.position
         particles = particles.changed(velocity=self.sampled(particles, grid, field, points))
-        return particles if self.reservoirs is None else self.reservoirs.driven(particles)
+        return particles if self.reservoirs is None else self.reservoirs.driven(particles, channel=True)
 
     def sampled(
         self, particles: Particles, grid: Grid, field: Tensor, position: Tensor | None = None

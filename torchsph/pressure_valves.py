@@ -22,10 +22,10 @@ if TYPE_CHECKING:
     from .integrate import Stepper
     from .projection import ProjectionStepper
 
-# depth (spacings) inside an opening at which the pressure is read, and the velocity of fluid that enters; that of fluid
-# that leaves is read in the opening itself, for it may still be gathering speed there. Support of the weight that reads
-# them, and how deep particles matter for it.
-_DEPTH, _RADIUS = 1.0, 2.0
+# depth (spacings) inside an opening at which the pressure is read, and the velocity of fluid that enters (new particles
+# are noisy); that of fluid that leaves is read in the opening itself, where it may still gather speed. Support of the
+# weight that reads them, and how deep particles matter for it.
+_DEPTH, _ENTRY, _RADIUS = 1.0, 0.5, 2.0
 _REACH = _DEPTH + 1.5**2 * _RADIUS
 
 
@@ -102,7 +102,7 @@ class PressureValves:
         deep = torch.full_like(height, _DEPTH)
         old = (mine.velocity - frame.velocity) @ frame.normal
         leaves = _mean(old, mine.member, mine.members).index_select(0, mine.member) > 0
-        along = read((near.velocity - frame.velocity) @ frame.normal, old, torch.where(leaves, 0.0 * deep, deep))
+        along = read((near.velocity - frame.velocity) @ frame.normal, old, _ENTRY * (~leaves).to(deep.dtype))
         pressure = read(stepper.pressure(near), stepper.pressure(mine), deep)
         return frame.velocity + along[:, None] * frame.normal, pressure
 

@@ -12,9 +12,9 @@ from .incompressible import Projection
 from .integrate import Surroundings
 from .neighbours import PairSearch
 from .pairs.interface import MomentumTerms, Rates, RateTerms, Support, per_particle
+from .pairs.poisson import PoissonSolution
 from .parameters import Coefficients
 from .particles import Particles
-from .poisson import PoissonProblem, PoissonSolution, solve
 from .record import Record
 from .smoothing import kernel
 from .terms import shifting_displacement, softened_share
@@ -115,37 +115,35 @@ class Neighbourhood:
     ) -> tuple[Tensor, PoissonSolution]:
         """Solve -laplacian(u) = ``source`` (N,); minus the gradient of u (N, D), 0 in reservoirs, and the solution.
 
-        The solution is continued into reservoirs. Walls and buffers are impermeable to u (Neumann); where ``surface``
-        (N,) bool u is 0, where ``held`` (N,) bool, in buffers, it is as in ``start``.
+        Walls and buffers are impermeable to u (Neumann); where ``surface`` (N,) bool u is 0, where ``held`` (N,) bool,
+        in buffers, it is as in ``start``.
         """
         p, backend = self.particles, self.search.backend
         state, fluid = p.state(p.deviation), p.fluid
         coupled = fluid if held is None else fluid | held
-        diagonal = backend.laplacian(self.pairs, state, self.support, torch.zeros_like(source), coupled)[1]
         free, singular = fluid, torch.ones(p.members, dtype=torch.bool, device=fluid.device)
         if surface is not None:
             free = fluid & ~surface
             singular = p.per_member(surface.to(torch.int64), "sum") == 0
-        if held is not None:
-            singular = singular & (p.per_member(held.to(torch.int64), "sum") == 0)
-        problem = PoissonProblem(
-            lambda u: backend.laplacian(self.pairs, state, self.support, u, coupled)[0], diagonal, p.mass, free,
-            singular, p.member, p.members,
-        )
         source = source * self.share
         if held is not None:
+            singular = singular & (p.per_member(held.to(torch.int64), "sum") == 0)
             kept = torch.where(held, start, torch.zeros_like(start))
-            source = source - problem.apply(kept)
-        found = solve(problem, source, start, tolerance=tolerance, iterations=iterations)
+            source = source - backend.laplacian(self.pairs, state, self.support, kept, coupled)[0]
+        found = backend.poisson(
+            self.pairs, state, self.support, source, start, free=free, active=coupled, singular=singular,
+            tolerance=tolerance, iterations=iterations,
+        )
         if held is not None:
             found = replace(found, values=found.values + kept)
         if self.wall is not None:
-            part = problem.total(torch.where(fluid, p.mass * self.share, torch.zeros_like(source)))
-            whole = problem.total(torch.where(fluid, p.mass, torch.zeros_like(source)))
-            found = replace(found, mismatch=found.mismatch * whole / part.clamp_min(_TINY))
-        terms = MomentumTerms(pressure="difference")
-        found = replace(found, values=self._continued(found.values, held))
-        slope = backend.momentum(self.pairs, p.state(found.values), self.support, terms)
+            volume = torch.where(fluid, p.mass, torch.zeros_like(p.mass)).double()
+            part = p.per_member(volume * self.share, "sum").clamp_min(_TINY)
+            found = replace(found, mismatch=found.mismatch * p.per_member(volume, "sum") / part)
+        # buffers take no part: the gradient by differences then continues the fluid's own pressure into them
+        mass = p.mass if bool(coupled.all()) else torch.where(coupled, p.mass, torch.zeros_like(p.mass))
+        state = p.changed(mass=mass).state(found.values)
+        slope = backend.momentum(self.pairs, state, self.support, MomentumTerms(pressure="difference"))
         slope = slope / self.share[:, None] if self.wall is not None else slope
         slope = torch.where(fluid[:, None], slope, torch.zeros_like(slope))
         return (slope if self.wall is not None else self._without_thrust(slope)), found
@@ -159,22 +157,6 @@ class Neighbourhood:
         mass = p.per_member(p.mass, "sum").clamp_min(_TINY)
         thrust = push.new_zeros((p.members, push.shape[1])).index_add(0, p.member, p.mass[:, None] * push)
         return push - (thrust / mass[:, None]).index_select(0, p.member)
-
-    def _continued(self, values: Tensor, held: Tensor | None) -> Tensor:
-        """Values of the fluid and where ``held``, and in other buffers the mean of the fluid around: (N,)."""
-        fluid = self.particles.fluid if held is None else self.particles.fluid | held
-        if bool(fluid.all()):
-            return values
-        part = torch.where(fluid, self.particles.mass, torch.zeros_like(values))
-
-        def around(mass: Tensor) -> Tensor:
-            state = self.particles.changed(mass=mass).state(values)
-            terms = RateTerms(continuity=None, shepard=True)
-            return self.search.backend.rates(self.pairs, state, self.support, terms).shepard_mass
-
-        weight = around(part)
-        mean = around(part * values) / weight.clamp_min(torch.finfo(weight.dtype).tiny)
-        return torch.where(fluid, values, torch.where(weight > 0, mean, torch.zeros_like(mean)))
 
 
 def divergence_free(
@@ -256,62 +238,106 @@ class ProjectionStepper:
     ) -> tuple[Particles, Tensor, WallSample | None]:
         """Advance every member by its own ``step`` (members,), internal time.
 
-        Friction and body forces first, then the projection, then the motion with the projected velocity. Returns the
-        particles, their acceleration (N, D) and the walls that they saw.
+        Half the way with the old velocity, there friction and body forces and the projection, then the other half with
+        the new velocity: positions are so of second order. Returns the particles, their acceleration (N, D) and the
+        walls that they saw, as they were at the start.
         """
         dt = per_particle(step, particles.member)
-        wall, before = around.sample(particles), particles.velocity
-        pairs = self.pair_search.at(particles)
-        force = self._without_pressure(particles, pairs, wall, around)
+        half = 0.5 * dt[:, None]
+        # a member that is not finite must not keep the others from their search; its velocity still gives it away
+        way = torch.nan_to_num(half * particles.velocity, nan=0.0, posinf=0.0, neginf=0.0)
+        middle = particles.changed(position=particles.position + way)
+        middle = around.later(middle, 0.5 * step)
+        wall, before = around.sample(middle), middle.velocity
+        here = Neighbourhood(middle, self.pair_search, self.pair_search.at(middle), self.support, wall)
+        weight = self._weight(middle, around)
+        sums, force = self._sums(here, around, weight)
         if force is not None:
-            moved = before + dt[:, None] * force
-            particles = particles.changed(velocity=torch.where(particles.fluid[:, None], moved, before))
-        here = Neighbourhood(particles, self.pair_search, pairs, self.support, wall)
-        sums = here.rates(self._terms)
-        divergence, crowding = here.divergence(sums)
+            pushed = torch.where(middle.fluid[:, None], middle.velocity + dt[:, None] * force, middle.velocity)
+            middle = middle.changed(velocity=pushed)
+        # the divergence of friction itself, small in a fluid of little viscosity, is met in the next step
+        divergence, crowding = replace(here, particles=middle).divergence(sums)
+        source, surface = self._source(here, sums, divergence)
+        held = None
+        if self.held_kinds is not None:
+            held = torch.isin(middle.kind, self.held_kinds)
+            source = source - self._drawn_in(middle, held, around)
+        push, found = here.push(
+            source, self._guess(middle, weight, dt), surface, self.scheme.tolerance, self.scheme.iterations, held
+        )
+        self._account(found, step)
+        velocity = middle.velocity + push
+        # what has not converged is no start for the next solve
+        per_step = torch.where(dt > 0, 1.0 / dt.clamp_min(torch.finfo(dt.dtype).tiny), torch.zeros_like(dt))
+        pressure = found.values * per_step * found.converged.index_select(0, particles.member)
+        pressure = pressure if weight is None else pressure + (weight * middle.position).sum(1)
+        drift = half * velocity
+        if crowding is not None:
+            drift = drift + self._shifted(middle.changed(velocity=velocity), crowding, step)
+        acceleration = (velocity - before) * per_step[:, None]
+        after = middle.changed(position=middle.position + drift, velocity=velocity, pressure=pressure)
+        return after, acceleration, None if wall is None else _earlier(wall, half, before)
+
+    def _source(self, here: Neighbourhood, sums: Rates, divergence: Tensor) -> tuple[Tensor, Tensor | None]:
+        """Source of the pressure (N,), and which particles lie at a free surface (N,) bool, or None."""
         surface, source = None, -divergence
         filling = here.filling(sums) if self._terms.shepard else None
         if self.scheme.surface is not None:
             surface = filling < self.scheme.surface
         if self.scheme.relaxation is not None:
-            counted = particles.inside if surface is None else particles.inside & ~surface
+            inside = here.particles.inside
+            counted = inside if surface is None else inside & ~surface
             source = source + here.excess(filling, counted) / self.scheme.relaxation
-        held = None if self.held_kinds is None else torch.isin(particles.kind, self.held_kinds)
-        push, found = here.push(
-            source, self._guess(particles, dt), surface, self.scheme.tolerance, self.scheme.iterations, held
-        )
-        self._account(found, step)
-        velocity = particles.velocity + push
-        # what has not converged is no start for the next solve
-        per_step = torch.where(dt > 0, 1.0 / dt.clamp_min(torch.finfo(dt.dtype).tiny), torch.zeros_like(dt))
-        pressure = found.values * per_step * found.converged.index_select(0, particles.member)
-        particles = particles.changed(velocity=velocity, pressure=pressure)
-        drift = dt[:, None] * velocity
-        if crowding is not None:
-            drift = drift + self._shifted(particles, crowding, step)
-        acceleration = (velocity - before) * per_step[:, None]
-        return particles.changed(position=particles.position + drift), acceleration, wall
+        return source, surface
 
-    def _without_pressure(
-        self, particles: Particles, pairs: Any, wall: WallSample | None, around: Surroundings
-    ) -> Tensor | None:
-        """Acceleration (N, D) by friction and body forces, or None without either."""
-        total = around.body_force(particles)
+    @staticmethod
+    def _drawn_in(particles: Particles, held: Tensor, around: Surroundings) -> Tensor:
+        """What the volume of the fluid inside should grow by, per time (N,), where a pressure is ``held`` (N,) bool.
+
+        Through other openings the flux sees to it; here the flow has to draw in what is missing.
+        """
+        drawn = particles.per_member(held.to(torch.int64), "sum") > 0
+        drawn = particles.inside & drawn.index_select(0, particles.member)
+        return torch.where(drawn, around.shortfall(particles), torch.zeros_like(particles.mass))
+
+    def _weight(self, particles: Particles, around: Surroundings) -> Tensor | None:
+        """The part (N, D) of a body force that only adds its potential to the pressure, or None.
+
+        Without a free surface or a given pressure a uniform force moves nothing along an axis that is not periodic. The
+        pressure that bears it would be large, and its differences on disordered particles stir the fluid; so it is left
+        out of the equation and added afterwards, exactly.
+        """
+        bound = self.scheme.surface is not None or self.held_kinds is not None
+        force = None if bound else around.body_force(particles)
+        if force is None or self.pair_search.period is None:
+            return force
+        return torch.where(torch.isinf(self.pair_search.period), force, torch.zeros_like(force))
+
+    def _sums(
+        self, here: Neighbourhood, around: Surroundings, weight: Tensor | None
+    ) -> tuple[Rates, Tensor | None]:
+        """First-pass sums, and the acceleration (N, D) by friction and body forces but ``weight``, or None."""
+        particles, wall, total = here.particles, here.wall, around.body_force(here.particles)
+        if weight is not None:
+            total = total - weight if self.pair_search.period is not None else None
         if self._laminar is None:
-            return total
+            return here.rates(self._terms), total
         state = particles.state(particles.deviation)
-        drag = self.pair_search.backend.momentum(pairs, state, self.support, self._laminar)
+        sums, drag = here.search.backend.right_hand_side(here.pairs, state, self.support, self._terms, self._laminar)
         if wall is not None:
             if self.scheme.wall.no_slip:
                 nu = per_particle(self.coefficients.viscosity, particles.member)
                 drag = drag + friction(nu, particles.velocity, wall)
             drag = drag / wall.share.clamp_min(SMALLEST_SHARE)[:, None]
-        return drag if total is None else total + drag
+        return sums, drag if total is None else total + drag
 
     @staticmethod
-    def _guess(particles: Particles, dt: Tensor) -> Tensor | None:
+    def _guess(particles: Particles, weight: Tensor | None, dt: Tensor) -> Tensor | None:
         """The last step's pressure times this step; None before the first (half the iterations of a start from 0)."""
-        return None if particles.pressure is None else particles.pressure * dt
+        if particles.pressure is None:
+            return None
+        pressure = particles.pressure
+        return dt * (pressure if weight is None else pressure - (weight * particles.position).sum(1))
 
     def _shifted(self, particles: Particles, crowding: Tensor, step: Tensor) -> Tensor:
         shift = shifting_displacement(
@@ -327,3 +353,9 @@ class ProjectionStepper:
         record.unconverged += steps & ~found.converged
         mismatch = torch.where(steps, found.mismatch.abs(), torch.zeros_like(found.mismatch))
         record.largest_mismatch = torch.maximum(record.largest_mismatch, mismatch)
+
+
+def _earlier(wall: WallSample, half: Tensor, velocity: Tensor) -> WallSample:
+    """Walls seen half a step later, with the distance that there was before, to first order: ``half`` (N, 1), time."""
+    way = (half * (velocity - wall.velocity) * wall.normal).sum(1)
+    return replace(wall, distance=wall.distance - way)

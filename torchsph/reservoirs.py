@@ -129,6 +129,13 @@ class Reservoirs:
         mean = particles.per_member(weight * particles.deviation, "sum") / total
         return particles.changed(deviation=particles.deviation - per_particle(mean, particles.member))
 
+    def shortfall(self, particles: Particles) -> Tensor:
+        """Share of the cavity's volume, per time, that should come in for what particles lack, (members,)."""
+        times = self.domain.member_times(particles.members)
+        if self.relaxation is None:
+            return torch.zeros_like(times, dtype=self.domain.dtype)
+        return self._deficit(particles, times) / (self._looked_up(self.volume, times) * self.relaxation)
+
     def frame(self, number: int) -> Frame:
         """Opening ``number`` now, to within the little that it changes in ``pace``."""
         time = self.domain.now if self.pace is None else round(self.domain.now / self.pace) * self.pace
@@ -209,13 +216,19 @@ class Reservoirs:
         total = particles.per_member(weight * particles.deviation, "sum")
         return (total / particles.per_member(weight, "sum").clamp_min(1.0))[members]
 
-    def driven(self, particles: Particles, step: Tensor | None = None) -> Particles:
-        """Give the buffers' particles their velocity, at the end of the ``step`` (members,), internal, just taken.
+    @staticmethod
+    def _mouth_pressure(
+        particles: Particles, frame: Frame, pressure: Callable[[Particles], Tensor]
+    ) -> Callable[[Particles], Tensor]:
+        """Mean pressure of the fluid near an orifice, which buffers of the incompressible scheme have none of."""
+        near = particles.select(((particles.position - frame.centre).norm(dim=1) < frame.radius) & particles.fluid)
+        total = near.per_member(pressure(near), "sum")
+        mean = total / near.per_member(torch.ones_like(near.mass), "sum").clamp_min(1.0)
+        return lambda some: mean.index_select(0, some.member)
 
-        Without a step, that of the present time, and the free channels' particles theirs as well.
-        """
-        times, channel = self.domain.member_times(particles.members), step is None
-        times = times if channel else times + step.double() * self.units.time
+    def driven(self, particles: Particles, *, channel: bool = False) -> Particles:
+        """Give the buffers' particles their velocity for the present time; with ``channel`` also the free channels'."""
+        times = self.domain.member_times(particles.members)
         inflow = self.inflow(times)
         active = self.active()
         held = self.relaxation is not None and not any(number in self.given for number, _ in active)
@@ -317,10 +330,12 @@ class Reservoirs:
             ):
                 if not bool(which.any()):
                     continue
-                some = particles.select(which)
+                some, level = particles.select(which), pressure
+                if which is entered and particles.pressure is not None and number not in self.given:
+                    level = self._mouth_pressure(particles, frame, pressure)
                 counter[:, valve] += some.per_member(torch.ones_like(some.member), "sum")
                 volume[:, valve] += some.per_member(some.mass.double(), "sum") * unit
-                energy[:, valve] += some.per_member(carried_energy(some, pressure(some)), "sum") * self._energy
+                energy[:, valve] += some.per_member(carried_energy(some, level(some)), "sum") * self._energy
         particles = particles.changed(kind=kind)
         if not fresh and not bool(gone.any()):
             return particles, False

@@ -43,6 +43,19 @@ typedef struct {
       *laplacian, *diagonal, *gradient, *moment_first, *moment_second, *moment_mass;
 } sph_pass;
 
+typedef struct { /* the pressure Poisson equation; see poisson.hpp */
+  sph_pass pass;              /* terms: the Laplacian; its sums are not written */
+  const void *source, *start; /* (particles,); start null: from 0 */
+  const uint8_t *free, *singular; /* (particles,) unknowns, (members,) where the constant is in the null space */
+  const int64_t* member;      /* (particles,) */
+  int64_t members, iterations;
+  double tolerance;
+  void* values;               /* (particles,) */
+  int64_t* count;             /* (members,) iterations, and so on */
+  double *residual, *mismatch;
+  uint8_t* converged;
+} sph_poisson;
+
 typedef struct { /* moments of a first-order moving-least-squares fetch; see interpolation.hpp */
   sph_search particles;
   const void* fields;         /* (particles, columns) */
@@ -89,6 +102,8 @@ int64_t sph_list_f32(const sph_search*, int64_t capacity, sph_lists*); /* entrie
 int64_t sph_list_f64(const sph_search*, int64_t capacity, sph_lists*);
 int sph_pass_f32(const sph_pass*);
 int sph_pass_f64(const sph_pass*);
+int sph_poisson_f32(const sph_poisson*);
+int sph_poisson_f64(const sph_poisson*);
 int64_t sph_interpolate_f32(const sph_interpolation*); /* number of unusable particles and queries; 0: done */
 int64_t sph_interpolate_f64(const sph_interpolation*);
 void sph_look_up_f32(const sph_look_up*);

@@ -88,6 +88,27 @@ class PassArguments(ctypes.Structure):
     ]
 
 
+class PoissonArguments(ctypes.Structure):
+    """sph_poisson of csrc/interface.h."""
+
+    _fields_ = [
+        ("pass_", PassArguments),
+        ("source", _pointer),
+        ("start", _pointer),
+        ("free", _pointer),
+        ("singular", _pointer),
+        ("member", _pointer),
+        ("members", _long),
+        ("iterations", _long),
+        ("tolerance", _real),
+        ("values", _pointer),
+        ("count", _pointer),
+        ("residual", _pointer),
+        ("mismatch", _pointer),
+        ("converged", _pointer),
+    ]
+
+
 class InterpolationArguments(ctypes.Structure):
     """sph_interpolation of csrc/interface.h."""
 
@@ -223,6 +244,7 @@ def _declare(handle: ctypes.CDLL) -> ctypes.CDLL:
         listing.argtypes = [ctypes.POINTER(SearchArguments), _long, ctypes.POINTER(ListArguments)]
         listing.restype = _long
         getattr(handle, f"sph_pass_{reals}").argtypes = [ctypes.POINTER(PassArguments)]
+        getattr(handle, f"sph_poisson_{reals}").argtypes = [ctypes.POINTER(PoissonArguments)]
         look_up = getattr(handle, f"sph_look_up_{reals}")
         look_up.argtypes, look_up.restype = [ctypes.POINTER(LookUpArguments)], None
         interpolate = getattr(handle, f"sph_interpolate_{reals}")
