@@ -117,14 +117,17 @@ class Reservoirs:
         return (self._looked_up(self.volume, times, torch.float64) - filled).to(self.domain.dtype)
 
     def _levelled(self, particles: Particles) -> Particles:
-        """Particles whose mean density deviation is 0, in compressible schemes.
+        """Particles whose mean density deviation at the open valves is 0, in compressible schemes.
 
         Where the speed of all that encloses a fluid is prescribed, the percents by which sums over neighbours miss the
         volume that is swept add up, to a pressure that is the same everywhere and tells nothing but feeds disorder.
         """
         if self.domain.scheme.sound_speed is None:
             return particles
-        weight = torch.where(particles.inside, particles.mass, torch.zeros_like(particles.mass))
+        near = torch.zeros_like(particles.inside)
+        for _, frame in self.active():
+            near |= (particles.position - frame.centre).square().sum(1) < frame.radius**2
+        weight = torch.where(particles.inside & near, particles.mass, torch.zeros_like(particles.mass))
         total = particles.per_member(weight, "sum").clamp_min(1.0)
         mean = particles.per_member(weight * particles.deviation, "sum") / total
         return particles.changed(deviation=particles.deviation - per_particle(mean, particles.member))
