@@ -5,8 +5,10 @@ import pytest
 import torch
 
 import geometry
-from torchsph import CompleteKernelWall, PotentialWall, Scene, Simulator, preset
+from torchsph import CompleteKernelWall, PotentialWall, Rollback, Scene, Simulator, preset
 from torchsph.particles import Particles
+from torchsph.record import Record
+from torchsph.rollback import Checkpoints
 from torchsph.scene import Fluid, Valve
 
 DENSITY = 1000.0
@@ -139,6 +141,21 @@ def test_the_work_of_a_source_is_force_times_velocity_exactly():
     gained = 0.5 * 1060.0 * scene.spacing**3 * float(run.particles.velocity.square().sum() - 0.14)
     assert abs(gained) > 1e-3 * 0.5 * 1060.0 * scene.spacing**3 * 0.14
     assert float(run.record.source_work) == pytest.approx(gained, rel=1e-9)
+
+
+def test_what_is_taken_back_has_not_happened():
+    """A rollback puts every account of a member back to what it was at the state that it goes back to."""
+    run = started(geometry.WallMotion.at_rest(square(8)), "default", 8)
+    record = Record(2, 1)
+    checkpoints = Checkpoints(Rollback(), record)
+    both = run.particles.repeated(2)
+    still, done = torch.zeros_like(both.position), torch.zeros(2, dtype=torch.float64)
+    checkpoints.keep(both, still, done)
+    names = ("inflow", "outflow", "energy_in", "energy_out", "wall_work", "source_work", "merged", "reseeded")
+    for name in names:
+        getattr(record, name).add_(1)
+    checkpoints.restored(torch.tensor([True, False]), both, still, done)
+    assert all(getattr(record, name).flatten().tolist() == [0, 1] for name in names)
 
 
 def test_walls_at_rest_and_scenes_without_sources_keep_no_account():

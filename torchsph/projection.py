@@ -18,7 +18,8 @@ from .particles import Particles
 from .record import Record
 from .smoothing import kernel
 from .terms import shifting_displacement, softened_share
-from .walls import SMALLEST_SHARE, WallSample, completed, friction
+from .wall_pass import complete_forces, complete_rates
+from .walls import SMALLEST_SHARE, WallSample
 
 if TYPE_CHECKING:
     from .domain import Domain
@@ -105,7 +106,7 @@ class Neighbourhood:
     def divergence(self, sums: Rates) -> tuple[Tensor, Tensor | None]:
         """Velocity divergence (N,) for the pressure to answer, and the crowding gradient (N, D), complete at walls."""
         p, wall = self.particles, self.wall
-        divergence, crowding = completed(sums.divergence, sums.concentration, p.velocity, wall)
+        divergence, crowding = complete_rates(sums.divergence, sums.concentration, p.velocity, wall)
         moves = wall is not None and bool(wall.velocity.any())
         return (divergence - self.wall_jump() if moves else divergence), crowding
 
@@ -325,10 +326,8 @@ class ProjectionStepper:
         state = particles.state(particles.deviation)
         sums, drag = here.search.backend.right_hand_side(here.pairs, state, self.support, self._terms, self._laminar)
         if wall is not None:
-            if self.scheme.wall.no_slip:
-                nu = per_particle(self.coefficients.viscosity, particles.member)
-                drag = drag + friction(nu, particles.velocity, wall)
-            drag = drag / wall.share.clamp_min(SMALLEST_SHARE)[:, None]
+            nu = self.coefficients.viscosity if self.scheme.wall.no_slip else None
+            drag = complete_forces(drag, particles.velocity, wall, viscosity=nu, member=particles.member)
         return sums, drag if total is None else total + drag
 
     @staticmethod
