@@ -19,6 +19,7 @@ from .schemes import CompleteKernelWall, PressureSource, Reservoir
 from .smoothing import kernel
 from .transfer import fill_beyond
 from .units import Units
+from .wall_pass import near_wall
 from .wallfield import WallFields
 from .walls import WallSample
 from .work import energy_unit
@@ -252,15 +253,14 @@ class Domain:
             after = self.reservoirs.driven(after)
         if wall is None or not isinstance(self.scheme.wall, CompleteKernelWall):
             return after
-        dt = per_particle(step, after.member)
-        moved = after.position - before.position - dt[:, None] * wall.velocity
-        distance = wall.distance + (moved * wall.normal).sum(1)
         gap = self.scheme.wall.gap
         # few particles are that close: the rest is for them alone
-        near = torch.nonzero((distance < gap) & after.fluid).squeeze(1)
+        near, distance = near_wall(
+            before.position, after.position, wall, step, after.member, after.fluid, gap
+        )
         if near.numel() == 0:
             return after
-        distance, normal = distance[near], wall.normal[near]
+        normal = wall.normal[near]
         record.crossed_wall.index_add_(0, after.member[near], (distance < 0).to(torch.int64))
         velocity = after.velocity[near]
         towards = ((velocity - wall.velocity[near]) * normal).sum(1).clamp_max(0.0)

@@ -18,7 +18,8 @@ from .particles import Particles
 from .record import Record
 from .smoothing import kernel
 from .terms import shifting_displacement, softened_share
-from .walls import SMALLEST_SHARE, WallSample, completed, friction
+from .wall_pass import complete_forces, complete_rates
+from .walls import SMALLEST_SHARE, WallSample
 
 if TYPE_CHECKING:
     from .domain import Domain
@@ -137,7 +138,7 @@ def divergence_free(
     particles = around.particles
     for _ in range(times):
         now = Neighbourhood(particles, around.search, around.pairs, around.support, around.wall)
-        divergence, _ = completed(now.rates(RateTerms()).divergence, None, particles.velocity, around.wall)
+        divergence, _ = complete_rates(now.rates(RateTerms()).divergence, None, particles.velocity, around.wall)
         push, found = now.push(-divergence, None, None, tolerance, iterations)
         particles = particles.changed(velocity=particles.velocity + push)
     return particles.velocity, found
@@ -223,7 +224,7 @@ class ProjectionStepper:
             pushed = torch.where(middle.fluid[:, None], middle.velocity + dt[:, None] * force, middle.velocity)
             middle = middle.changed(velocity=pushed)
         # the divergence of friction itself, small in a fluid of little viscosity, is met in the next step
-        divergence, crowding = completed(sums.divergence, sums.concentration, middle.velocity, wall)
+        divergence, crowding = complete_rates(sums.divergence, sums.concentration, middle.velocity, wall)
         source, surface = self._source(here, sums, divergence)
         held = None
         if self.held_kinds is not None:
@@ -292,10 +293,8 @@ class ProjectionStepper:
         state = particles.state(particles.deviation)
         sums, drag = here.search.backend.right_hand_side(here.pairs, state, self.support, self._terms, self._laminar)
         if wall is not None:
-            if self.scheme.wall.no_slip:
-                nu = per_particle(self.coefficients.viscosity, particles.member)
-                drag = drag + friction(nu, particles.velocity, wall)
-            drag = drag / wall.share.clamp_min(SMALLEST_SHARE)[:, None]
+            nu = self.coefficients.viscosity if self.scheme.wall.no_slip else None
+            drag = complete_forces(drag, particles.velocity, wall, viscosity=nu, member=particles.member)
         return sums, drag if total is None else total + drag
 
     @staticmethod

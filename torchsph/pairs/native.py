@@ -169,7 +169,44 @@ class LookUpArguments(ctypes.Structure):
         ("origin", _real * 3),
         ("step", _real * 3),
         ("counts", _long * 3),
+        ("unit", _int),
         ("out", _pointer),
+    ]
+
+
+class WallArguments(ctypes.Structure):
+    """sph_walls of csrc/interface.h."""
+
+    _fields_ = [
+        ("dimension", _int),
+        ("threads", _int),
+        ("form", _int),
+        ("count", _long),
+        ("channels", _long),
+        ("rows", _pointer),
+        ("velocity", _pointer),
+        ("divergence", _pointer),
+        ("crowding", _pointer),
+        ("whole_divergence", _pointer),
+        ("whole_crowding", _pointer),
+        ("pressure", _pointer),
+        ("deviation", _pointer),
+        ("viscosity", _pointer),
+        ("viscosities", _long),
+        ("member", _pointer),
+        ("acceleration", _pointer),
+        ("whole_acceleration", _pointer),
+        ("smallest_share", _real),
+        ("smallest_gap", _real),
+        ("before", _pointer),
+        ("after", _pointer),
+        ("distance", _pointer),
+        ("distance_stride", _long),
+        ("step", _pointer),
+        ("held", _pointer),
+        ("gap", _real),
+        ("near", _pointer),
+        ("near_distance", _pointer),
     ]
 
 
@@ -247,6 +284,9 @@ def _declare(handle: ctypes.CDLL) -> ctypes.CDLL:
         getattr(handle, f"sph_poisson_{reals}").argtypes = [ctypes.POINTER(PoissonArguments)]
         look_up = getattr(handle, f"sph_look_up_{reals}")
         look_up.argtypes, look_up.restype = [ctypes.POINTER(LookUpArguments)], None
+        for name, result in (("wall_rates", None), ("wall_forces", None), ("wall_near", _long)):
+            part = getattr(handle, f"sph_{name}_{reals}")
+            part.argtypes, part.restype = [ctypes.POINTER(WallArguments)], result
         interpolate = getattr(handle, f"sph_interpolate_{reals}")
         interpolate.argtypes, interpolate.restype = [ctypes.POINTER(InterpolationArguments)], _long
     handle.sph_grid_closest.argtypes, handle.sph_grid_closest.restype = [ctypes.POINTER(ClosestArguments)], None

@@ -63,8 +63,8 @@ class Calibration:
 
 
 def features(estimates: Estimates, beam: Tensor, axial: bool) -> Tensor:
-    """What the log variance is linear in, (n, 6): 1, predicted log variance, log(1 - rho), log peak ratio,
-    SNR and share of power passed by the clutter filter (both in 10 dB).
+    """What the log variance is linear in, (n, 8): 1, predicted log variance, log(1 - rho), log peak ratio, log shear,
+    and in 10 dB the SNR, the share of power passed by the clutter filter and its response to the velocity.
 
     All bounded, so that an odd estimate cannot ask for an absurd deviation. An unknown SNR counts as 20 dB.
     """
@@ -75,7 +75,10 @@ def features(estimates: Estimates, beam: Tensor, axial: bool) -> Tensor:
     ratio = estimates.peak_ratio.clamp(1.0, 10.0).log()
     snr = torch.nan_to_num(estimates.snr, nan=20.0).clamp(-10, 40) / 10
     power = torch.nan_to_num(estimates.power, nan=0.0).clamp(-60, 5) / 10
-    return torch.stack([torch.ones_like(predicted), predicted, decorrelation, ratio, snr, power], 1)
+    response = torch.nan_to_num(estimates.response, nan=0.0).clamp(-20, 0) / 10
+    shear = torch.nan_to_num(estimates.shear, nan=10.0).clamp(10.0, 300.0).log()
+    one = torch.ones_like(predicted)
+    return torch.stack([one, predicted, decorrelation, ratio, shear, snr, power, response], 1)
 
 
 def fit_calibration(estimates: Estimates, error: Tensor, beam: Tensor) -> Calibration:

@@ -15,6 +15,8 @@ from .echoes import EchoModel, simulate_packet
 from .estimates import Estimates
 from .tracking import SpeckleTracker
 
+IN_PLANE = 4
+
 
 @dataclass(frozen=True, eq=False)
 class SwirlFlow:
@@ -48,7 +50,7 @@ def random_swirl(
     centre: tuple[float, ...], radius: float, speed: float, generator: torch.Generator,
     *, waves: int = 6, tissue_speed: float = 0.0,
 ) -> SwirlFlow:  # fmt: skip
-    """A swirl of RMS ``speed``, m/s, with wavelengths between one and three diameters of the ball.
+    """A swirl of RMS ``speed``, m/s, with wavelengths between half a diameter of the ball and three.
 
     Each component of the tissue's velocity is drawn with a deviation of ``tissue_speed``, m/s.
     """
@@ -61,7 +63,7 @@ def random_swirl(
     length = (
         2
         * radius
-        * (1 + 2 * torch.rand(waves, generator=generator, dtype=torch.float64, device=generator.device))
+        * (0.5 + 2.5 * torch.rand(waves, generator=generator, dtype=torch.float64, device=generator.device))
     )
     amplitude = normal(waves, dimension)
     amplitude = amplitude - (amplitude * direction).sum(1, keepdim=True) * direction
@@ -75,9 +77,9 @@ def random_swirl(
 
 @dataclass(frozen=True)
 class TrainingPlan:
-    """simulations: packets. radius: of the blood, m. margin: tissue around it in view, m. step: between
-    points, m.
+    """simulations: packets in space; a plane, which holds fewer points, takes ``IN_PLANE`` times as many.
 
+    radius: of the blood, m. margin: tissue around it in view, m. step: between points, m.
     slowest, fastest: RMS speeds, m/s, spread evenly over the simulations on a logarithmic scale.
     tissue_speed: deviation of each component of the tissue's velocity, m/s.
     """
@@ -129,12 +131,13 @@ def calibrate(
     )
     points = training_points(plan, centre).to(generator.device)
     parts, errors = [], []
-    for number in range(plan.simulations):
-        share = number / (plan.simulations - 1)
+    simulations = plan.simulations * (IN_PLANE if grid.dimension == 2 else 1)
+    for number in range(simulations):
+        share = number / (simulations - 1)
         speed = plan.slowest ** (1 - share) * plan.fastest**share
         flow = random_swirl(centre, plan.radius, speed, generator, tissue_speed=plan.tissue_speed)
         estimates = tracker.track(simulate_packet(flow, grid, model, 0.0, generator), points)
         parts.append(estimates)
         errors.append(estimates.velocity - flow.velocity(points, 0.0).to(estimates.velocity))
-    beam = model.beams.directions(torch.cat([points] * plan.simulations)).to(errors[0])
+    beam = model.beams.directions(torch.cat([points] * simulations)).to(errors[0])
     return fit_calibration(Estimates.joined(parts), torch.cat(errors), beam)
