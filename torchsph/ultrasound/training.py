@@ -13,7 +13,7 @@ from geometry import Grid
 from .calibration import Calibration, fit_calibration
 from .echoes import EchoModel, simulate_packet
 from .estimates import Estimates
-from .tracking import SpeckleTracker
+from .plugin import Tracker
 
 IN_PLANE = 4
 FINEST, COARSEST = 0.25, 3.0  # 2 mm, which is twice a kernel of table 3.1, to 24 mm for the default plan
@@ -114,7 +114,7 @@ def training_points(plan: TrainingPlan, centre: tuple[float, ...]) -> Tensor:
 
 
 def calibrate(
-    model: EchoModel, tracker: SpeckleTracker, spacing: tuple[float, ...], generator: torch.Generator,
+    model: EchoModel, tracker: Tracker, spacing: tuple[float, ...], generator: torch.Generator,
     plan: TrainingPlan = TrainingPlan(), *, centre: tuple[float, ...] | None = None,
 ) -> Calibration:  # fmt: skip
     """Fit deviations and weights of ``tracker`` on random swirls; image ``spacing`` x, y, z, m.
