@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 def energy_unit(units: Units, density: float, dimension: int) -> float:
-    """J (in a plane J/m) of a particle of one internal mass with twice the reference speed squared / 2."""
+    """J (in a plane J/m) per internal energy, which counts masses in those of a spacing^D of fluid at rest density."""
     return density * units.length**dimension * units.speed**2
 
 
@@ -41,7 +41,7 @@ class WorkAccount:
     Pressure does the work  int p v_wall . n dA,  as a sum over the particles whose kernels the wall cuts: the kernel's
     integral over the wall is the gradient of its share inside (Ferrand et al. 2013), and half of a kernel centred on a
     plane wall lies inside. Where the wall is curved or folded that half is off by the curvature over a kernel's radius.
-    A potential wall does the work of its force and of its retardation, which is exact. What walls do to particles that
+    A potential wall does the work of the force and the retardation that particles feel. What walls do to particles that
     they stop outright is added where that happens (``Domain.constrain``).
     """
 
