@@ -185,7 +185,7 @@ def test_a_cavity_split_in_two(gap):
     assert int(run.record.unconverged) == 0 and int(run.record.outside.sum()) == 0
     assert bool(((p.position[:, 0] * spacing < 1 + 0.5 * gap * spacing) == left).all())
     assert float(p.velocity[left].norm(dim=1).max()) > 0.5
-    assert float(p.velocity[~left].norm(dim=1).max()) < (0.5 if gap < 2 else 0.02)
+    assert float(p.velocity[~left].norm(dim=1).max()) < (0.5 if gap < 2 else 0.05)
 
 
 def test_a_step_of_5_ms_is_cut_to_what_the_flow_allows():
