@@ -33,6 +33,10 @@ _TINY = 1e-6
 _SHARES = 16
 # a displacement of more than this (spacings) would outrun the linearisation
 _LARGEST_MOVE = 0.2
+# part of a full kernel's moment below which no slope is drawn from what is left of it
+_SMALLEST_MOMENT = 0.3
+# cosine between the share's gradient and the wall's normal below which a wall is not plain
+_EDGE = 0.9
 
 
 @dataclass(frozen=True)
@@ -76,6 +80,35 @@ class Neighbourhood:
         mean = filling.new_zeros(size).index_add(0, group, weight * filling) / count.clamp_min(1.0)
         excess = (filling / mean[group].clamp_min(_TINY) - 1.0).clamp(-_LARGEST_EXCESS, _LARGEST_EXCESS)
         return torch.where(counted, excess, torch.zeros_like(excess))
+
+    def wall_jump(self) -> Tensor:
+        """What the divergence at walls lacks, as a source (N,): half of the jump from the fluid's speed to the wall's.
+
+        Of a jump at the wall the kernels of the fluid see the half that lies on their side; a wall that accelerates
+        would so be followed by halves only. The fluid's normal velocity is continued linearly to the wall first, so
+        that a flow that keeps to the wall has no jump. Meant for walls that move: what it adds to those at rest is
+        noise at their edges.
+        """
+        p, wall = self.particles, self.wall
+        steep = wall.share_gradient.norm(dim=1)
+        terms = MomentumTerms(pressure="difference")
+        along = (p.velocity * wall.normal).sum(1)
+        fall = self.search.backend.momentum(self.pairs, p.state(along), self.support, terms)
+        # the sum's own moment across a plane wall, by the divergence theorem
+        moment = (wall.share - wall.distance * steep).clamp_min(_SMALLEST_MOMENT)
+        rise = -(fall * wall.normal).sum(1) / moment
+        jump = (wall.velocity * wall.normal).sum(1) - along + wall.distance.clamp_min(0.0) * rise
+        # where walls meet at an edge there is no such line to continue on
+        cosine = (wall.share_gradient * wall.normal).sum(1) / steep.clamp_min(_TINY)
+        plain = (cosine - _EDGE).clamp_min(0.0) / (1.0 - _EDGE)
+        return torch.where(p.fluid, plain * jump * steep / self.share, torch.zeros_like(jump))
+
+    def divergence(self, sums: Rates) -> tuple[Tensor, Tensor | None]:
+        """Velocity divergence (N,) for the pressure to answer, and the crowding gradient (N, D), complete at walls."""
+        p, wall = self.particles, self.wall
+        divergence, crowding = complete_rates(sums.divergence, sums.concentration, p.velocity, wall)
+        moves = wall is not None and bool(wall.velocity.any())
+        return (divergence - self.wall_jump() if moves else divergence), crowding
 
     def push(
         self, source: Tensor, start: Tensor | None, surface: Tensor | None, tolerance: float, iterations: int,
@@ -138,7 +171,7 @@ def divergence_free(
     particles = around.particles
     for _ in range(times):
         now = Neighbourhood(particles, around.search, around.pairs, around.support, around.wall)
-        divergence, _ = complete_rates(now.rates(RateTerms()).divergence, None, particles.velocity, around.wall)
+        divergence, _ = now.divergence(now.rates(RateTerms()))
         push, found = now.push(-divergence, None, None, tolerance, iterations)
         particles = particles.changed(velocity=particles.velocity + push)
     return particles.velocity, found
@@ -224,7 +257,7 @@ class ProjectionStepper:
             pushed = torch.where(middle.fluid[:, None], middle.velocity + dt[:, None] * force, middle.velocity)
             middle = middle.changed(velocity=pushed)
         # the divergence of friction itself, small in a fluid of little viscosity, is met in the next step
-        divergence, crowding = complete_rates(sums.divergence, sums.concentration, middle.velocity, wall)
+        divergence, crowding = replace(here, particles=middle).divergence(sums)
         source, surface = self._source(here, sums, divergence)
         held = None
         if self.held_kinds is not None:

@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from .pairs.interface import per_particle, square_length
+from .pairs.interface import inner, per_particle, square_length
 from .particles import Particles
 from .record import Record
 from .schemes import CompleteKernelWall, PotentialWall
 from .units import Units
-from .walls import WallSample, friction, potential_force, retardation
+from .walls import WallSample, friction_rate, potential_force, retardation
 
 if TYPE_CHECKING:
     from .domain import Domain
@@ -94,10 +94,10 @@ class WorkAccount:
                 dt = per_particle(step, stepped.member)
                 change = stepped.velocity - retardation(self._wall, sound, -dt, stepped.velocity, wall)
                 force = force + change / dt.clamp_min(torch.finfo(dt.dtype).tiny)[:, None]
-            return (force * wall.velocity).sum(1)
-        swept = (wall.velocity * wall.share_gradient).sum(1) if wall.swept is None else wall.swept
+            return inner(force, wall.velocity)
+        swept = inner(wall.velocity, wall.share_gradient) if wall.swept is None else wall.swept
         power = 2.0 * stepper.pressure(stepped) / (1.0 + stepped.deviation) * swept
         if self._friction and c.viscosity is not None:
-            drag = friction(per_particle(c.viscosity, stepped.member), before.velocity, wall)
-            power = power + (drag * wall.velocity).sum(1)
+            rate = friction_rate(per_particle(c.viscosity, stepped.member), wall)
+            power = power + rate * (square_length(wall.velocity) - inner(before.velocity, wall.velocity))
         return power

@@ -282,12 +282,17 @@ def per_particle(value: float | Tensor, member: Tensor) -> float | Tensor:
     return value.index_select(0, member) if isinstance(value, Tensor) and value.ndim else value
 
 
-def square_length(vectors: Tensor) -> Tensor:
-    """|v|^2 (N,) of vectors (N, D), column by column: a third of the time of a reduction over so short an axis."""
-    total = vectors[:, 0] * vectors[:, 0]
-    for axis in range(1, vectors.shape[1]):
-        total = total + vectors[:, axis] * vectors[:, axis]
+def inner(first: Tensor, second: Tensor) -> Tensor:
+    """Inner products (N,) of vectors (N, D), column by column: less than a reduction over so short an axis takes."""
+    total = first[:, 0] * second[:, 0]
+    for axis in range(1, first.shape[1]):
+        total = torch.addcmul(total, first[:, axis], second[:, axis])
     return total
+
+
+def square_length(vectors: Tensor) -> Tensor:
+    """|v|^2 (N,) of vectors (N, D)."""
+    return inner(vectors, vectors)
 
 
 def check_search(position: Tensor | None, radius: float, period: Tensor | None) -> None:
