@@ -61,6 +61,20 @@ def test_calibration_finds_the_law_that_made_the_errors():
     assert (weight[inner][variance[inner].argsort()].diff() <= 1e-6).all()  # falls with the deviation
 
 
+def test_a_tracker_that_tells_its_correlation_alone_is_calibrated_by_it():
+    generator = torch.Generator().manual_seed(6)
+    unknown = torch.full((4000,), torch.nan)
+    found = estimates(4000, generator, unknown)
+    correlation = 0.5 + 0.49 * torch.rand(4000, generator=generator)
+    names = ("peak_ratio", "power", "snr", "response", "shear")
+    found = dataclasses.replace(found, correlation=correlation, **dict.fromkeys(names, unknown))
+    true = (1 - correlation)[:, None].expand(-1, 3)
+    beam = torch.tensor([[0.0, 0.0, 1.0]]).expand(4000, 3)
+    model = fit_calibration(found, true * torch.randn((4000, 3), generator=generator), beam)
+    inner = (correlation > 0.55) & (correlation < 0.95)
+    torch.testing.assert_close(model.sigma(found, beam)[inner], true[inner], rtol=0.25, atol=0)
+
+
 def test_weight_is_zero_where_an_estimate_is_flagged():
     generator = torch.Generator().manual_seed(1)
     found = estimates(200, generator, torch.full((200,), 1e-4))

@@ -42,7 +42,7 @@ def squeezed(name, rate, pressure=None):
     return run, exact()
 
 
-@pytest.mark.parametrize(("name", "bound"), [("projection", 0.08), ("default", 0.17)])
+@pytest.mark.parametrize(("name", "bound"), [("projection", 0.06), ("default", 0.15)])
 def test_a_squeezed_tube_flows_out_as_it_must(name, bound):
     """Velocity everywhere against the exact one; the weakly compressible fluid rings, at a fifth of usual speeds."""
     run, exact = squeezed(name, -4.0)
@@ -55,11 +55,12 @@ def test_a_squeezed_tube_flows_out_as_it_must(name, bound):
     assert int(run.record.crossed_wall.sum()) == 0 and int(run.record.outside.sum()) == 0
 
 
-def test_a_widened_tube_is_filled_as_it_must():
-    run, exact = squeezed("projection", 4.0)
+@pytest.mark.parametrize("name", ["projection", "default"])
+def test_a_widened_tube_is_filled_as_it_must(name):
+    run, exact = squeezed(name, 4.0)
     p = run.particles
     deep = p.inside & (p.position[:, 2] < 0.5 * LENGTH / SPACING)
-    assert float((p.velocity - exact)[deep].norm() / exact[deep].norm()) < 0.12
+    assert float((p.velocity - exact)[deep].norm() / exact[deep].norm()) < 0.09
     volume = run.domain.fluid_volume(TIME) / SPACING**3
     assert float(p.mass[p.inside].sum()) == pytest.approx(volume, rel=0.02)
     assert int(run.record.outside.sum()) == 0 and not bool(run.record.failed.any())

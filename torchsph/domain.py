@@ -158,6 +158,11 @@ class Domain:
         """Set the present time of the members, s: (members,) float64 or one for all."""
         self._times = torch.as_tensor(times, dtype=torch.float64, device=self.device)
 
+    @property
+    def now(self) -> float:
+        """Present time, s, on the average over the members."""
+        return float(self._times.mean())
+
     def later(self, particles: Particles, step: Tensor) -> Particles:
         """Go on by ``step`` (members,), internal; the particles with what buffers do at that time."""
         self.at(self.member_times(particles.members) + step.double() * self.units.time)

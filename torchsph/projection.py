@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
+from .components import components
 from .incompressible import Projection
 from .integrate import Surroundings
 from .neighbours import PairSearch
@@ -33,6 +35,10 @@ _TINY = 1e-6
 _SHARES = 16
 # a displacement of more than this (spacings) would outrun the linearisation
 _LARGEST_MOVE = 0.2
+# part of a full kernel's moment below which no slope is drawn from what is left of it
+_SMALLEST_MOMENT = 0.3
+# cosine between the share's gradient and the wall's normal below which a wall is not plain
+_EDGE = 0.9
 
 
 @dataclass(frozen=True)
@@ -77,6 +83,35 @@ class Neighbourhood:
         excess = (filling / mean[group].clamp_min(_TINY) - 1.0).clamp(-_LARGEST_EXCESS, _LARGEST_EXCESS)
         return torch.where(counted, excess, torch.zeros_like(excess))
 
+    def wall_jump(self) -> Tensor:
+        """What the divergence at walls lacks, as a source (N,): half of the jump from the fluid's speed to the wall's.
+
+        Of a jump at the wall the kernels of the fluid see the half that lies on their side; a wall that accelerates
+        would so be followed by halves only. The fluid's normal velocity is continued linearly to the wall first, so
+        that a flow that keeps to the wall has no jump. Meant for walls that move: what it adds to those at rest is
+        noise at their edges.
+        """
+        p, wall = self.particles, self.wall
+        steep = wall.share_gradient.norm(dim=1)
+        terms = MomentumTerms(pressure="difference")
+        along = (p.velocity * wall.normal).sum(1)
+        fall = self.search.backend.momentum(self.pairs, p.state(along), self.support, terms)
+        # the sum's own moment across a plane wall, by the divergence theorem
+        moment = (wall.share - wall.distance * steep).clamp_min(_SMALLEST_MOMENT)
+        rise = -(fall * wall.normal).sum(1) / moment
+        jump = (wall.velocity * wall.normal).sum(1) - along + wall.distance.clamp_min(0.0) * rise
+        # where walls meet at an edge there is no such line to continue on
+        cosine = (wall.share_gradient * wall.normal).sum(1) / steep.clamp_min(_TINY)
+        plain = (cosine - _EDGE).clamp_min(0.0) / (1.0 - _EDGE)
+        return torch.where(p.fluid, plain * jump * steep / self.share, torch.zeros_like(jump))
+
+    def divergence(self, sums: Rates) -> tuple[Tensor, Tensor | None]:
+        """Velocity divergence (N,) for the pressure to answer, and the crowding gradient (N, D), complete at walls."""
+        p, wall = self.particles, self.wall
+        divergence, crowding = complete_rates(sums.divergence, sums.concentration, p.velocity, wall)
+        moves = wall is not None and bool(wall.velocity.any())
+        return (divergence - self.wall_jump() if moves else divergence), crowding
+
     def push(
         self, source: Tensor, start: Tensor | None, surface: Tensor | None, tolerance: float, iterations: int,
         held: Tensor | None = None,
@@ -89,19 +124,23 @@ class Neighbourhood:
         p, backend = self.particles, self.search.backend
         state, fluid = p.state(p.deviation), p.fluid
         coupled = fluid if held is None else fluid | held
-        free, singular = fluid, torch.ones(p.members, dtype=torch.bool, device=fluid.device)
-        if surface is not None:
-            free = fluid & ~surface
-            singular = p.per_member(surface.to(torch.int64), "sum") == 0
+        bound = torch.zeros_like(fluid) if surface is None else surface
         source = source * self.share
         if held is not None:
-            singular = singular & (p.per_member(held.to(torch.int64), "sum") == 0)
+            bound = bound | held
             kept = torch.where(held, start, torch.zeros_like(start))
             source = source - backend.laplacian(self.pairs, state, self.support, kept, coupled)[0]
-        found = backend.poisson(
-            self.pairs, state, self.support, source, start, free=free, active=coupled, singular=singular,
-            tolerance=tolerance, iterations=iterations,
-        )
+
+        def solved(group: Tensor, groups: int) -> PoissonSolution:
+            pinned = torch.zeros(groups, dtype=torch.int64, device=group.device).index_add(0, group, bound.long())
+            return backend.poisson(
+                self.pairs, state, self.support, source, start, free=fluid & ~bound, active=coupled,
+                singular=pinned == 0, tolerance=tolerance, iterations=iterations, group=group,
+            )
+
+        found = solved(p.member, p.members)
+        if not bool(found.converged.all()):
+            found = self._by_parts(found, coupled, solved)
         if held is not None:
             found = replace(found, values=found.values + kept)
         if self.wall is not None:
@@ -115,6 +154,31 @@ class Neighbourhood:
         slope = slope / self.share[:, None] if self.wall is not None else slope
         slope = torch.where(fluid[:, None], slope, torch.zeros_like(slope))
         return (slope if self.wall is not None else self._without_thrust(slope)), found
+
+    def _by_parts(
+        self, found: PoissonSolution, coupled: Tensor, solved: Callable[[Tensor, int], PoissonSolution]
+    ) -> PoissonSolution:
+        """What ``solved`` finds where each part that hangs together has a constant of its own; ``found`` if all do.
+
+        Looked for only where the solver failed: cavities in two halves and drops are rare, and finding them is slow.
+        """
+        p = self.particles
+        part, count = components(p.position, p.member, coupled, self.support.radius, self.search.period)
+        if count == p.members:
+            return found
+        apart = solved(part, count)
+        owner = torch.zeros(count, dtype=torch.int64, device=part.device).index_copy(0, part, p.member)
+
+        def of_members(values: Tensor, way: str, start: Tensor) -> Tensor:
+            return start.scatter_reduce(0, owner, values, way)
+
+        nothing = torch.zeros_like(found.residual)
+        largest = of_members(apart.mismatch.abs(), "amax", nothing)
+        return PoissonSolution(
+            apart.values, of_members(apart.iterations, "amax", found.iterations),
+            of_members(apart.residual, "amax", nothing),
+            of_members(apart.converged.long(), "amin", torch.ones_like(found.iterations)) > 0, largest,
+        )
 
     def _without_thrust(self, push: Tensor) -> Tensor:
         """``push`` (N, D) without its mean: pressure inside a fluid that touches nothing cannot move it as a whole.
@@ -138,7 +202,7 @@ def divergence_free(
     particles = around.particles
     for _ in range(times):
         now = Neighbourhood(particles, around.search, around.pairs, around.support, around.wall)
-        divergence, _ = complete_rates(now.rates(RateTerms()).divergence, None, particles.velocity, around.wall)
+        divergence, _ = now.divergence(now.rates(RateTerms()))
         push, found = now.push(-divergence, None, None, tolerance, iterations)
         particles = particles.changed(velocity=particles.velocity + push)
     return particles.velocity, found
@@ -224,7 +288,7 @@ class ProjectionStepper:
             pushed = torch.where(middle.fluid[:, None], middle.velocity + dt[:, None] * force, middle.velocity)
             middle = middle.changed(velocity=pushed)
         # the divergence of friction itself, small in a fluid of little viscosity, is met in the next step
-        divergence, crowding = complete_rates(sums.divergence, sums.concentration, middle.velocity, wall)
+        divergence, crowding = replace(here, particles=middle).divergence(sums)
         source, surface = self._source(here, sums, divergence)
         held = None
         if self.held_kinds is not None:

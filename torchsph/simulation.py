@@ -226,6 +226,7 @@ class Simulation:
         before, push = self.particles, self._acceleration
         inner = step.to(before.position.dtype)
         stepped, acceleration, wall = self._stepper.step(before, inner, self.record.steps, self.domain)
+        self.domain.at(self.time + (done + step) * self.units.time)
         after = self.domain.constrain(before, stepped, wall, inner, self.record)
         waiting = step == 0
         if bool(waiting.any()):

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from .pairs.interface import square_length
 from .schemes import PotentialWall
 
 # the velocity gradient at the wall is taken over at least this distance (spacings): closer particles would be braked
@@ -96,8 +97,12 @@ def completed(
     return divergence, None if crowding is None else crowding - wall.share_gradient
 
 
+def friction_rate(viscosity: float | Tensor, wall: WallSample) -> Tensor:
+    """2 nu |grad share| / d (N,): by which laminar friction takes on a no-slip wall's velocity (see ``friction``)."""
+    gap = wall.distance.clamp_min(SMALLEST_FRICTION_DISTANCE)
+    return 2.0 * viscosity * square_length(wall.share_gradient).sqrt() / gap
+
+
 def friction(viscosity: float | Tensor, velocity: Tensor, wall: WallSample) -> Tensor:
     """Laminar friction with a no-slip wall: 2 nu |grad share| (v_wall - v) / d (Ferrand et al. 2013 eq. 30)."""
-    gap = wall.distance.clamp_min(SMALLEST_FRICTION_DISTANCE)
-    rate = 2.0 * viscosity * wall.share_gradient.norm(dim=1) / gap
-    return rate[:, None] * (wall.velocity - velocity)
+    return friction_rate(viscosity, wall)[:, None] * (wall.velocity - velocity)

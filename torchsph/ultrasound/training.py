@@ -13,9 +13,10 @@ from geometry import Grid
 from .calibration import Calibration, fit_calibration
 from .echoes import EchoModel, simulate_packet
 from .estimates import Estimates
-from .tracking import SpeckleTracker
+from .plugin import Tracker
 
 IN_PLANE = 4
+FINEST, COARSEST = 0.25, 3.0  # 2 mm, which is twice a kernel of table 3.1, to 24 mm for the default plan
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +51,10 @@ def random_swirl(
     centre: tuple[float, ...], radius: float, speed: float, generator: torch.Generator,
     *, waves: int = 6, tissue_speed: float = 0.0,
 ) -> SwirlFlow:  # fmt: skip
-    """A swirl of RMS ``speed``, m/s, with wavelengths between half a diameter of the ball and three.
+    """A swirl of RMS ``speed``, m/s, with wavelengths of ``FINEST`` to ``COARSEST`` diameters of the ball.
+
+    They are spread evenly on a logarithmic scale: vortices as large as a ventricle, shear layers that a kernel
+    hardly resolves.
 
     Each component of the tissue's velocity is drawn with a deviation of ``tissue_speed``, m/s.
     """
@@ -60,11 +64,8 @@ def random_swirl(
         return torch.randn(shape, generator=generator, dtype=torch.float64, device=generator.device)
 
     direction = torch.nn.functional.normalize(normal(waves, dimension), dim=1)
-    length = (
-        2
-        * radius
-        * (0.5 + 2.5 * torch.rand(waves, generator=generator, dtype=torch.float64, device=generator.device))
-    )
+    share = torch.rand(waves, generator=generator, dtype=torch.float64, device=generator.device)
+    length = 2 * radius * FINEST * (COARSEST / FINEST) ** share
     amplitude = normal(waves, dimension)
     amplitude = amplitude - (amplitude * direction).sum(1, keepdim=True) * direction
     mean = normal(dimension)
@@ -113,7 +114,7 @@ def training_points(plan: TrainingPlan, centre: tuple[float, ...]) -> Tensor:
 
 
 def calibrate(
-    model: EchoModel, tracker: SpeckleTracker, spacing: tuple[float, ...], generator: torch.Generator,
+    model: EchoModel, tracker: Tracker, spacing: tuple[float, ...], generator: torch.Generator,
     plan: TrainingPlan = TrainingPlan(), *, centre: tuple[float, ...] | None = None,
 ) -> Calibration:  # fmt: skip
     """Fit deviations and weights of ``tracker`` on random swirls; image ``spacing`` x, y, z, m.
