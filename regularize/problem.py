@@ -6,11 +6,12 @@ from math import prod
 import torch
 
 from .block import BlockFactor
+from .correlated import CorrelatedErrors
 from .direct import Factor, PreparedSystem, solve_direct
 from .field import SplineField
 from .krylov import Solution
 from .likelihood import Choice
-from .operators import System
+from .operators import System, VectorRows
 from .posterior import Posterior
 from .samples import FitData
 
@@ -33,10 +34,20 @@ class Problem:
         covered[self.system.cells()] = True
         posterior = None
         if factor is not None and own_factor:
-            posterior = Posterior(factor, self.precision(solution), self.system.components)
+            posterior = self.posterior(solution, factor)
         return SplineField(
             knots, coefficients, covered, solution, data.left_out, self.choice, posterior, factor
         )
+
+    def posterior(self, solution: Solution, factor: Factor | BlockFactor) -> Posterior:
+        """The posterior, with what the samples' errors are found to have in common."""
+        precision, data, system = self.precision(solution), self.data, self.system
+        fit, widened = system.blocks[0], None
+        if isinstance(fit, VectorRows) and not data.over_time and factor.ordering.nodes.device.type == "cpu":
+            fitted = fit.with_unit_weight().matvec(solution.x.view(system.knots.nodes, -1)).view_as(data.velocity)
+            errors = CorrelatedErrors(system, factor.ordering, factor, data.weight, precision)
+            widened = errors.inflation(data.velocity - fitted)
+        return Posterior(factor, precision, system.components, widened)
 
     def precision(self, solution: Solution) -> float:
         """Turns the cost into minus twice a log-posterior: the weight of all samples over their variance.

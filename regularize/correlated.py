@@ -1,0 +1,161 @@
+"""Errors that neighbouring samples share: how far they reach, and how much less the samples then determine.
+
+A tracker's error is much the same over its resolution cell: a hundred samples may hold the information of one. The
+cost counts them as independent, with the noise that the resolved scales show; that hardly moves the fit but makes its
+posterior too narrow on long scales. Here the errors' covariance is taken as a white part and a part that falls off as
+a Gaussian of the distance. Its size, share and length are those for which errors so drawn, sent through the fit, leave
+residuals like the ones that the data left (indirect inference: C. Gourieroux, A. Monfort and E. Renault, J. Appl.
+Econometrics 8, 1993, S85): the fit takes the long waves of the errors for flow, so that its residuals alone show less
+of them than there is. With what the penalties leave open drawn beside them, the draws have the covariance
+M^-1 (A'C A + P) M^-1 of the fit's error (the sandwich of P. Huber, Proc. Fifth Berkeley Symp. 1, 1967, 221), where C
+is the samples' covariance and P the penalties' precision; with independent errors it is the posterior's M^-1.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+
+from .block import BlockFactor
+from .direct import Factor
+from .operators import System, VectorRows
+from .ordering import Ordering
+
+CENTRES = 500  # samples whose neighbours are looked at
+REACH = 6.0  # typical distances between samples over which correlation is looked for
+BINS = 12
+FAR = 3.0  # robust standard deviations at which residuals are cut: a hop is no correlated error
+FEWEST = 100  # samples
+DRAWS = 8
+WAVES = 64  # of which a drawn error field is made
+ROUNDS = 5  # of the search for errors that leave the residuals found
+STEP = 2.0  # at most by this factor does a round change the size or length of the errors
+
+
+@dataclass(frozen=True)
+class Correlation:
+    """Of the samples' errors, per velocity component: deviation (m/s, full weight), correlated share, length (m)."""
+
+    deviation: torch.Tensor
+    share: torch.Tensor
+    length: torch.Tensor
+
+
+class _Pairs:
+    """Pairs of samples, of which one is among CENTRES drawn at random, by distance."""
+
+    def __init__(self, points: np.ndarray) -> None:
+        tree = cKDTree(points)
+        centres = np.random.default_rng(0).permutation(len(points))[:CENTRES]
+        typical = float(np.median(tree.query(points[centres], k=2)[0][:, 1]))
+        near = tree.query_ball_point(points[centres], REACH * max(typical, 1e-12))
+        first = np.repeat(centres, [len(each) for each in near])
+        second = np.concatenate([np.asarray(each, int) for each in near])
+        self.first, self.second = first[first != second], second[first != second]
+        distance = np.linalg.norm(points[self.first] - points[self.second], axis=1)
+        self.far = float(distance.max(initial=typical))
+        self.place = np.minimum(distance / self.far * BINS, BINS - 1).astype(int)
+        self.count = np.bincount(self.place, minlength=BINS)
+        self.middle = np.bincount(self.place, distance, BINS) / np.maximum(self.count, 1)
+
+    def correlation(self, residual: torch.Tensor) -> Correlation:
+        """What residuals (n, C, draws) have in common in each component."""
+        far = FAR * 1.4826 * residual.abs().median(dim=0).values.mean(-1)[:, None]
+        cut = torch.maximum(torch.minimum(residual, far), -far)
+        deviation, fits = cut.square().mean((0, 2)).sqrt(), []
+        for k in range(len(deviation)):
+            e = (cut[:, k] / deviation[k]).numpy()
+            together = np.einsum("pd,pd->p", e[self.first], e[self.second]) / e.shape[1]
+            fits.append(self._gaussian(np.bincount(self.place, together, BINS) / np.maximum(self.count, 1)))
+        share, length = torch.tensor(fits, dtype=torch.float64).unbind(1)
+        return Correlation(deviation, share, length)
+
+    def _gaussian(self, correlation: np.ndarray) -> tuple[float, float]:
+        """Share in [0, 1] and length of share exp(-distance^2 / (2 length^2)), by least squares."""
+        best = (np.inf, 0.0, self.far)
+        for length in np.geomspace(0.05, 1.0, 60) * self.far:
+            curve = np.exp(-0.5 * (self.middle / length) ** 2)
+            scale = (self.count * curve**2).sum()
+            share = float(np.clip((self.count * curve * correlation).sum() / max(scale, 1e-300), 0.0, 1.0))
+            best = min(best, (float((self.count * (correlation - share * curve) ** 2).sum()), share, float(length)))
+        return best[1], best[2]
+
+
+class CorrelatedErrors:
+    """The errors of the full-vector samples in the first block of ``system``, and what they do to its solution.
+
+    ``weight`` (n,): the samples' row weights. ``precision``: as in ``Posterior``.
+    """
+
+    def __init__(
+        self, system: System, ordering: Ordering, factor: Factor | BlockFactor, weight: torch.Tensor, precision: float
+    ) -> None:
+        self.system, self.ordering, self.factor, self.precision = system, ordering, factor, precision
+        self.fit: VectorRows = system.blocks[0]
+        self.rows = self.fit.with_unit_weight().repeated(DRAWS * system.components)
+        self.weight = weight[:, None, None]
+        self.points = torch.tensor(self.fit.knots.spacing) * (self.fit.cell + self.fit.t)
+
+    def inflation(self, residual: torch.Tensor) -> torch.Tensor:
+        """(C,) factor, at least 1, on the posterior's standard deviations, for a fit that left residual (n, C)."""
+        used = self.weight[:, 0, 0] > 0
+        if int(used.sum()) < FEWEST or not bool((residual[used].abs().median(dim=0).values > 0).all()):
+            return torch.ones(residual.shape[1], dtype=torch.float64)
+        pairs = _Pairs(self.points[used].numpy())
+        errors = seen = pairs.correlation((self.weight * residual[:, :, None])[used])
+        for _ in range(ROUNDS):
+            drawn, fitted = self._fitted_errors(errors)
+            errors = _towards(errors, seen, pairs.correlation((self.weight * (drawn - fitted))[used]))
+        return self._spread(self._fitted_errors(errors)[1])
+
+    def _fitted_errors(self, errors: Correlation) -> tuple[torch.Tensor, torch.Tensor]:
+        """Errors (n, C, DRAWS) at the samples, and what the fit makes of them there."""
+        generator = torch.Generator().manual_seed(0)  # the same data give the same deviations
+        draws = torch.stack([_field(self.points, errors, generator) for _ in range(DRAWS)], dim=-1)
+        draws = errors.deviation[:, None] * draws / self.weight.clamp(min=1e-300)
+        draws = torch.where(self.weight > 0, draws, 0.0)
+        return draws, self._fitted(self._pulled(self.fit.weight[:, :, None] * draws))
+
+    def _spread(self, fitted: torch.Tensor) -> torch.Tensor:
+        """Deviations with the fitted errors given, over those with the white ones that the posterior stands for."""
+        generator, c = torch.Generator().manual_seed(1), self.system.components
+
+        def white(*shape: int) -> torch.Tensor:
+            return torch.randn(shape, generator=generator, dtype=torch.float64) / self.precision**0.5
+
+        left_open = self.system.damping * white(self.fit.knots.nodes, c, DRAWS)
+        for draw in left_open.unbind(-1):
+            for block in self.system.blocks[1:]:
+                draw += block.rmatvec(white(len(block.target)))
+        noise = self._pulled(white(len(self.fit), c, DRAWS))
+        open_part, white_part = (self._fitted(each).square().mean((0, 2)) for each in (left_open, noise))
+        return ((open_part + fitted.square().mean((0, 2))) / (open_part + white_part)).sqrt().clamp(min=1.0)
+
+    def _pulled(self, rows: torch.Tensor) -> torch.Tensor:
+        """Right-hand sides (nodes, C, DRAWS) of weighted sample values (n, C, DRAWS)."""
+        pulled = self.rows.rmatvec((self.fit.weight[:, :, None] * rows).flatten())
+        return pulled.view(len(pulled), *rows.shape[1:])
+
+    def _fitted(self, right: torch.Tensor) -> torch.Tensor:
+        """Fields (n, C, DRAWS) at the samples for right-hand sides (nodes, C, DRAWS)."""
+        solved = self.ordering.expand(self.factor.solve(right[self.ordering.nodes]))
+        return self.rows.matvec(solved.flatten(1)).view(len(self.fit), *right.shape[1:])
+
+
+def _towards(errors: Correlation, seen: Correlation, left: Correlation) -> Correlation:
+    """Errors whose residuals look more like the ones seen than the ones ``left`` by these."""
+    size = (seen.deviation / left.deviation).clamp(1 / STEP, STEP)
+    longer = (seen.length / left.length).clamp(1 / STEP, STEP)
+    share = (errors.share + seen.share - left.share).clamp(0.0, 1.0)
+    return Correlation(errors.deviation * size, share, errors.length * longer)
+
+
+def _field(points: torch.Tensor, errors: Correlation, generator: torch.Generator) -> torch.Tensor:
+    """(n, C) draw of variance 1: white, and plane waves with the spectrum of the correlated part."""
+    (n, axes), c = points.shape, len(errors.share)
+    white = torch.randn(n, c, generator=generator, dtype=torch.float64)
+    wave = torch.randn(c, WAVES, axes, generator=generator, dtype=torch.float64) / errors.length[:, None, None]
+    phase = 2 * torch.pi * torch.rand(c, WAVES, generator=generator, dtype=torch.float64)
+    smooth = [torch.cos(points @ wave[k].T + phase[k]).sum(1) * (2 / WAVES) ** 0.5 for k in range(c)]
+    return errors.share.sqrt() * torch.stack(smooth, dim=1) + (1 - errors.share).sqrt() * white
