@@ -117,6 +117,25 @@ def scores(field: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> dict:
     }
 
 
+def calibration(truth: geometry.Recording, measured: geometry.Recording, frames: list[int]) -> dict:
+    """Root mean square of (fit - truth) / std per component over the mask of some frames.
+
+    With the samples' errors taken for independent, with what neighbours share, and with the tracker's resolution cell
+    (as wide as the Gaussian above) told besides; "of the blurred truth": of what a tracker of that cell can see at all.
+    """
+    splines, total = FrameSmoother(measured, regularize.Smoother.preset("default"), choose_every=1), []
+    for frame in frames:
+        fitted, mask = splines.fit(frame, uncertainty=True), np.array(truth.mask[frame], bool)
+        points = splines.nodes[torch.from_numpy(mask.reshape(-1))]
+        blurred = gaussian(truth.velocity[frame], mask.astype(float), measured.grid.spacing)
+        off = [fitted(points).numpy() - each[:, mask].T for each in (truth.velocity[frame], blurred)]
+        std, wide = fitted.std(points).numpy(), fitted.std(points, blur=WIDTH).numpy()
+        one = fitted.posterior.inflation.numpy()
+        total.append([np.square(z).mean(0) for z in (off[0] / std * one, off[0] / std, off[0] / wide, off[1] / std)])
+    names = ("z_independent", "z", "z_with_blur", "z_of_the_blurred_truth")
+    return dict(zip(names, np.sqrt(np.mean(total, axis=0)).tolist(), strict=True))
+
+
 class Table:
     """Rows of a comparison with the truth, printed as they come."""
 
@@ -152,6 +171,7 @@ def compare(truth: geometry.Recording, measured: geometry.Recording, every: int,
         "noise_m_s": [list(choice.noise) for choice in choices],
         "no_slip": [choice.no_slip for choice in choices],
     }
+    more |= calibration(truth, measured, few)
     table.add("spline", fields, frames, seconds, **more)
     averaged = over_time(fields, np.asarray(truth.mask[frames], bool), measured.time)
     table.add("spline, 10 ms average", averaged, frames, seconds)
