@@ -96,6 +96,12 @@ class CorrelatedErrors:
         self.rows = self.fit.with_unit_weight().repeated(DRAWS * system.components)
         self.weight = weight[:, None, None]
         self.points = torch.tensor(self.fit.knots.spacing) * (self.fit.cell + self.fit.t)
+        generator = torch.Generator().manual_seed(0)  # the same data give the same deviations
+        shape = (system.components, WAVES, DRAWS)
+        self.white = torch.randn(len(self.fit), system.components, DRAWS, generator=generator, dtype=torch.float64)
+        self.waves = torch.randn(self.fit.knots.axes, *shape, generator=generator, dtype=torch.float64)
+        self.phase = 2 * torch.pi * torch.rand(shape, generator=generator, dtype=torch.float64)
+        self.generator = generator
 
     def inflation(self, residual: torch.Tensor) -> torch.Tensor:
         """(C,) factor, at least 1, on the posterior's standard deviations, for a fit that left residual (n, C)."""
@@ -111,26 +117,31 @@ class CorrelatedErrors:
 
     def _fitted_errors(self, errors: Correlation) -> tuple[torch.Tensor, torch.Tensor]:
         """Errors (n, C, DRAWS) at the samples, and what the fit makes of them there."""
-        generator = torch.Generator().manual_seed(0)  # the same data give the same deviations
-        draws = torch.stack([_field(self.points, errors, generator) for _ in range(DRAWS)], dim=-1)
-        draws = errors.deviation[:, None] * draws / self.weight.clamp(min=1e-300)
+        draws = errors.deviation[:, None] * self._field(errors) / self.weight.clamp(min=1e-300)
         draws = torch.where(self.weight > 0, draws, 0.0)
         return draws, self._fitted(self._pulled(self.fit.weight[:, :, None] * draws))
 
     def _spread(self, fitted: torch.Tensor) -> torch.Tensor:
         """Deviations with the fitted errors given, over those with the white ones that the posterior stands for."""
-        generator, c = torch.Generator().manual_seed(1), self.system.components
 
         def white(*shape: int) -> torch.Tensor:
-            return torch.randn(shape, generator=generator, dtype=torch.float64) / self.precision**0.5
+            return torch.randn(shape, generator=self.generator, dtype=torch.float64) / self.precision**0.5
 
-        left_open = self.system.damping * white(self.fit.knots.nodes, c, DRAWS)
+        left_open = self.system.damping * white(self.fit.knots.nodes, self.system.components, DRAWS)
         for draw in left_open.unbind(-1):
             for block in self.system.blocks[1:]:
                 draw += block.rmatvec(white(len(block.target)))
-        noise = self._pulled(white(len(self.fit), c, DRAWS))
+        noise = self._pulled(self.white / self.precision**0.5)  # the draws in the errors: their chance cancels
         open_part, white_part = (self._fitted(each).square().mean((0, 2)) for each in (left_open, noise))
         return ((open_part + fitted.square().mean((0, 2))) / (open_part + white_part)).sqrt().clamp(min=1.0)
+
+    def _field(self, errors: Correlation) -> torch.Tensor:
+        """(n, C, DRAWS) of variance 1: white, and plane waves with the spectrum of the correlated part."""
+        share, smooth = errors.share[:, None], torch.empty_like(self.white)
+        for k in range(self.system.components):
+            wave = (self.points @ self.waves[:, k].flatten(1)).view(-1, WAVES, DRAWS) / errors.length[k]
+            smooth[:, k] = torch.cos(wave + self.phase[k]).sum(1) * (2 / WAVES) ** 0.5
+        return share.sqrt() * smooth + (1 - share).sqrt() * self.white
 
     def _pulled(self, rows: torch.Tensor) -> torch.Tensor:
         """Right-hand sides (nodes, C, DRAWS) of weighted sample values (n, C, DRAWS)."""
@@ -149,13 +160,3 @@ def _towards(errors: Correlation, seen: Correlation, left: Correlation) -> Corre
     longer = (seen.length / left.length).clamp(1 / STEP, STEP)
     share = (errors.share + seen.share - left.share).clamp(0.0, 1.0)
     return Correlation(errors.deviation * size, share, errors.length * longer)
-
-
-def _field(points: torch.Tensor, errors: Correlation, generator: torch.Generator) -> torch.Tensor:
-    """(n, C) draw of variance 1: white, and plane waves with the spectrum of the correlated part."""
-    (n, axes), c = points.shape, len(errors.share)
-    white = torch.randn(n, c, generator=generator, dtype=torch.float64)
-    wave = torch.randn(c, WAVES, axes, generator=generator, dtype=torch.float64) / errors.length[:, None, None]
-    phase = 2 * torch.pi * torch.rand(c, WAVES, generator=generator, dtype=torch.float64)
-    smooth = [torch.cos(points @ wave[k].T + phase[k]).sum(1) * (2 / WAVES) ** 0.5 for k in range(c)]
-    return errors.share.sqrt() * torch.stack(smooth, dim=1) + (1 - errors.share).sqrt() * white

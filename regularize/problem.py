@@ -41,13 +41,19 @@ class Problem:
 
     def posterior(self, solution: Solution, factor: Factor | BlockFactor) -> Posterior:
         """The posterior, with what the samples' errors are found to have in common."""
-        precision, data, system = self.precision(solution), self.data, self.system
-        fit, widened = system.blocks[0], None
-        if isinstance(fit, VectorRows) and not data.over_time and factor.ordering.nodes.device.type == "cpu":
-            fitted = fit.with_unit_weight().matvec(solution.x.view(system.knots.nodes, -1)).view_as(data.velocity)
-            errors = CorrelatedErrors(system, factor.ordering, factor, data.weight, precision)
-            widened = errors.inflation(data.velocity - fitted)
-        return Posterior(factor, precision, system.components, widened)
+        return Posterior(factor, self.precision(solution), self.system.components, self.shared(solution, factor))
+
+    def shared(self, solution: Solution, factor: Factor | BlockFactor) -> torch.Tensor | None:
+        """(C,) factors on the posterior's deviations for errors that samples share; None where they are not looked for:
+
+        along beams, over time and on a GPU.
+        """
+        data, system, fit = self.data, self.system, self.system.blocks[0]
+        if not isinstance(fit, VectorRows) or data.over_time or factor.ordering.nodes.device.type != "cpu":
+            return None
+        fitted = fit.with_unit_weight().matvec(solution.x.view(system.knots.nodes, -1)).view_as(data.velocity)
+        errors = CorrelatedErrors(system, factor.ordering, factor, data.weight, self.precision(solution))
+        return errors.inflation(data.velocity - fitted)
 
     def precision(self, solution: Solution) -> float:
         """Turns the cost into minus twice a log-posterior: the weight of all samples over their variance.
@@ -58,7 +64,7 @@ class Problem:
         scale = self.data.weight.double().square().sum()
         scale = scale / (fit.weight.double().square().sum() / self.system.components)
         if self.choice is not None:
-            return float(scale * (torch.tensor(self.choice.noise, dtype=torch.float64) ** -2).mean())
+            return float(scale * (self.choice.deviation**-2).mean())
         residual = fit.target.double() - fit.matvec(solution.x.view(self.system.knots.nodes, -1))
         variance = residual.square().sum() / fit.weight.double().square().sum()
         return float(scale / variance.clamp(min=1e-300))

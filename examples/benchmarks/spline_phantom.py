@@ -80,7 +80,7 @@ class Splines:
     """Fits of some frames of a measurement, on its nodes, and what their analytic derivatives say."""
 
     def __init__(self, measured: geometry.Recording, smoother: regularize.Smoother) -> None:
-        self.frames = FrameSmoother(measured, smoother, choose_every=1)
+        self.frames = FrameSmoother(measured, smoother)
         self.divergence = self.gradient = 0.0
 
     def __call__(self, frame: int) -> np.ndarray:
@@ -123,7 +123,7 @@ def calibration(truth: geometry.Recording, measured: geometry.Recording, frames:
     With the samples' errors taken for independent, with what neighbours share, and with the tracker's resolution cell
     (as wide as the Gaussian above) told besides; "of the blurred truth": of what a tracker of that cell can see at all.
     """
-    splines, total = FrameSmoother(measured, regularize.Smoother.preset("default"), choose_every=1), []
+    splines, total = FrameSmoother(measured, regularize.Smoother.preset("default")), []
     for frame in frames:
         fitted, mask = splines.fit(frame, uncertainty=True), np.array(truth.mask[frame], bool)
         points = splines.nodes[torch.from_numpy(mask.reshape(-1))]
@@ -170,6 +170,7 @@ def compare(truth: geometry.Recording, measured: geometry.Recording, every: int,
         "curvature_mm": [1e3 * choice.curvature for choice in choices],
         "noise_m_s": [list(choice.noise) for choice in choices],
         "no_slip": [choice.no_slip for choice in choices],
+        "shared": [choice.shared for choice in choices],
     }
     more |= calibration(truth, measured, few)
     table.add("spline", fields, frames, seconds, **more)
