@@ -93,6 +93,7 @@ def test_assimilate_writes_what_it_promises(assimilated, files):
     assert {path.name for path in folder.iterdir()} == analyses | {
         "analysis.h5",
         "report.png",
+        "filter.png",
         "metrics.json",
     }
     measured = geometry.read_recording(files["measured"])
@@ -138,9 +139,9 @@ def test_assimilate_alone_runs_the_default_method_without_a_truth(files, tmp_pat
     arguments = ["assimilate", files["measured"], *QUICK, "--members", "3", "--out", str(out)]
     assert cli.main(arguments) == 0
     document = json.loads((out / "metrics.json").read_text())
-    assert list(document["methods"]) == ["raw", pipeline.DEFAULT_METHOD]
+    assert list(document["methods"]) == ["raw", "free", pipeline.DEFAULT_METHOD]
     assert "nrmse" not in document["methods"]["raw"] and document["methods"]["raw"]["residual_rms"] == 0
-    assert list(rows(capsys.readouterr().out)) == ["method", "raw", pipeline.DEFAULT_METHOD]
+    assert list(rows(capsys.readouterr().out)) == ["method", "raw", "free", pipeline.DEFAULT_METHOD]
 
 
 def test_one_asked_method_becomes_the_analysis(files, tmp_path):
@@ -236,7 +237,7 @@ FAULTS = {
     "truth of another grid": (["assimilate", "{measured}", "--truth", "{coarse_truth}"], "another grid"),
     "unknown method": (
         ["assimilate", "{measured}", "--method", "spline,magic"],
-        "unknown magic; known are spline",
+        "unknown magic; known are free, spline",
     ),
     "empty method": (["assimilate", "{measured}", "--method", "spline,"], "empty name"),
     "unknown preset": (["assimilate", "{measured}", "--preset", "best"], "choose from"),

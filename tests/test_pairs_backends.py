@@ -20,6 +20,7 @@ REFERENCE = ReferenceBackend()
 RATES = [
     RateTerms(continuity, *flags)
     for continuity, *flags in [
+        ("volume", False, True, False, True),
         ("volume", False, False, False, False, False),
         ("mass", False, False, False, False, False),
         ("mass", False, False, True, False, False),
@@ -93,7 +94,8 @@ class TestTerms:
 
     def test_both_passes_in_one(self, fast, dtype, dimension, periodic):
         state, lengths, pairs, wanted_pairs, wide = self.arrange(fast, dtype, dimension, periodic)
-        for rates, terms in itertools.product(RATES[:6], list(momentum_terms(dtype))[::3]):
+        alone = MomentumTerms(None, laminar=torch.tensor([0.1, 0.2], dtype=dtype))
+        for rates, terms in itertools.product(RATES[:7], [alone, *list(momentum_terms(dtype))[::3]]):
             got = fast.right_hand_side(pairs, state, lengths, rates, terms)
             wanted = REFERENCE.right_hand_side(wanted_pairs, wide, lengths, rates, terms)
             assert_close(got[0], wanted[0], dtype)
@@ -106,6 +108,25 @@ class TestTerms:
             wanted = REFERENCE.laplacian(wanted_pairs, wide, lengths, wide.pressure, active)
             assert_close(got[0], wanted[0], dtype)
             assert_close(got[1], wanted[1], dtype)
+
+    def test_poisson(self, fast, dtype, dimension, periodic):
+        """The same iterates as conjugate gradients in torch: with a start and without, some particles held at 0."""
+        state, lengths, pairs, wanted_pairs, wide = self.arrange(fast, dtype, dimension, periodic)
+        active = state.deviation > -0.015
+        free = active & (state.pressure > -1.5)
+        singular, options = torch.tensor([True, False]), {"tolerance": 1e-3, "iterations": 15}
+        for start in (None, 0.1 * wide.velocity[:, 0]):
+            asked = {"free": free, "active": active, "singular": singular, **options}
+            given = None if start is None else start.to(dtype)
+            got = fast.poisson(pairs, state, lengths, state.pressure, given, **asked)
+            wanted = REFERENCE.poisson(wanted_pairs, wide, lengths, wide.pressure, start, **asked)
+            assert_close(got.values, wanted.values, dtype)
+            assert torch.equal(got.converged, wanted.converged)
+            if dtype == torch.float64:
+                assert torch.equal(got.iterations, wanted.iterations)
+                torch.testing.assert_close(got.residual, wanted.residual, rtol=1e-6, atol=1e-9)
+                torch.testing.assert_close(got.mismatch, wanted.mismatch)
+            assert not bool(got.values[~free].any())
 
     def test_interpolation(self, fast, dtype, dimension, periodic):
         state, lengths, _, _, wide = self.arrange(fast, dtype, dimension, periodic)
@@ -253,3 +274,20 @@ def test_angular_momentum_of_central_forces_is_conserved_to_round_off(fast, dime
     x, f = state.position, force
     torque = x[:, 0] * f[:, 1] - x[:, 1] * f[:, 0]
     assert abs(float(torque.sum())) <= 1e-13 * float(torque.abs().sum())
+
+
+def test_a_pressure_that_cannot_be_found_says_so(fast):
+    """A member with NaN in its source, one that is done at once, one that needs more iterations than it gets."""
+    state, choice = disordered(6, 3, torch.float32, members=3), support("wendland_c2", 3)
+    pairs = fast.search(state.position, state.member, choice.radius)
+    source = torch.where(state.member == 1, torch.zeros_like(state.pressure), state.pressure)
+    spoilt = torch.nonzero(state.member == 0)[3]
+    source[spoilt] = float("nan")
+    every = torch.ones(len(source), dtype=torch.bool)
+    asked = {"free": every, "active": every, "singular": torch.ones(3, dtype=torch.bool), "tolerance": 1e-4}
+    few = fast.poisson(pairs, state, choice, source, None, iterations=3, **asked)
+    assert few.converged.tolist() == [False, True, False] and few.iterations.tolist() == [0, 0, 3]
+    assert bool(torch.isnan(few.residual[0])) and float(few.residual[2]) > 1e-4
+    enough = fast.poisson(pairs, state, choice, source, None, iterations=300, **asked)
+    assert enough.converged.tolist() == [False, True, True]
+    assert bool(torch.isfinite(enough.values[state.member > 0]).all())

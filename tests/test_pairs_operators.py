@@ -92,8 +92,8 @@ class TestOperators:
         lists = backend("cpu").search(state.position, state.member, 2.4).lists
         coefficients = torch.ones((1, 4), dtype=torch.float64)
         arrays = (state.position, state.velocity, state.mass, state.deviation, None, None, None, None)
-        terms = plan.SHEPARD | plan.CONTINUITY
-        with pytest.raises(NotImplementedError, match="0x101"):
+        terms = plan.SHEPARD | plan.XSPH
+        with pytest.raises(NotImplementedError, match="0x108"):
             operators.pair_pass(
                 lists, [float("inf")] * 3, [terms, 0, 0, 0], [2.0, 0.4], coefficients, *arrays
             )

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchsph.poisson import PoissonProblem, solve
+from torchsph.pairs.poisson import PoissonProblem, solve
 
 SIZES = (12, 20, 9)
 

@@ -191,6 +191,9 @@ def test_a_hole_at_a_wall_is_filled_and_nothing_lands_beyond(scheme):
     q = run.particles
     assert 0.6 * int((~stay).sum()) <= int(run.record.reseeded) <= 1.3 * int((~stay).sum())
     assert float((q.position - torch.tensor([8.0, 0.0]).double()).norm(dim=1).min()) < 1.5
+    stray = q.changed(position=q.position.index_fill(0, torch.tensor([0]), 1e6))  # no endless grid of cells for it
+    after, _ = run._population.controlled(stray, torch.tensor([True]))
+    assert bool(torch.isfinite(after.velocity).all()) and abs(after.count - q.count) < 5
     assert int(run.record.outside) == 0 and float(q.mass.sum()) == pytest.approx(float(p.mass.sum()), rel=1e-12)
 
 

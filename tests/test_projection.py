@@ -115,25 +115,32 @@ def test_a_batch_is_its_members():
         torch.testing.assert_close(mine, alone.particles.velocity, rtol=1e-6, atol=1e-8)
 
 
-def test_a_full_box_under_gravity_bears_its_weight():
-    """rho g (depth), up to the constant that a full box leaves open: within 5 % of rho g H, speeds below .1 sqrt(g H).
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_full_box_under_gravity_bears_its_weight(dtype):
+    """rho g (depth), up to the constant that a full box leaves open, on top of the pressure without gravity.
 
-    Coarse, and a known weakness: differences of a large pressure on disordered particles stir the fluid. Scenes of the
-    heart have no gravity; others take the weakly compressible scheme (test_validation_containers: within 1 %).
+    What is left of the start, as particles settle at the walls, moves at less than .01 sqrt(g H).
     """
     box = geometry.polygon(np.array([[0, 0], [1, 0], [1, 1], [0, 1]], float), 1 / 32)
-    scene = Scene(
-        spacing=1 / 16, fluid=Fluid(1000.0, 1.0), walls=geometry.WallMotion.at_rest(box), gravity=(0.0, -1.0),
-        dimension=2,
-    )  # fmt: skip
-    run = Simulator(scene, Projection(max_step=5e-3), dtype=torch.float64).start(0.0)
-    run.advance(1.0)
-    p = run.particles
-    pressure = (p.pressure * run.units.speed**2).numpy()  # over the density
-    height = (p.position[:, 1] * scene.spacing).numpy()
-    expected = height.mean() - height + pressure.mean()
-    assert np.sqrt(np.mean((pressure - expected) ** 2)) < 0.05
-    assert float(p.velocity.norm(dim=1).max()) < 0.1
+    runs = []
+    for gravity in ((0.0, -1.0), None):
+        scene = Scene(
+            spacing=1 / 16, fluid=Fluid(1000.0, 1e-2), walls=geometry.WallMotion.at_rest(box), gravity=gravity,
+            dimension=2,
+        )  # fmt: skip
+        runs.append(Simulator(scene, Projection(max_step=5e-3), dtype=dtype).start(0.0))
+        runs[-1].advance(0.01)
+    heavy, light = (run.particles for run in runs)
+    borne = ((heavy.pressure - light.pressure) * runs[0].units.speed**2).double()  # over the density
+    height = heavy.position[:, 1].double() / 16
+    torch.testing.assert_close(borne - borne.mean(), height.mean() - height, rtol=0, atol=1e-4)
+    torch.testing.assert_close(heavy.velocity, light.velocity, rtol=0, atol=1e-5)
+    runs[0].advance(0.5)
+    p = runs[0].particles
+    expected = height.mean() - p.position[:, 1].double() / 16
+    pressure = p.pressure.double() * runs[0].units.speed**2
+    assert float((pressure - pressure.mean() - expected).abs().max()) < 0.03
+    assert float(p.velocity.norm(dim=1).max()) < 0.01
 
 
 def test_a_closed_cavity_that_shrinks_is_reported_and_does_not_explode():

@@ -40,7 +40,7 @@ def estimates(count, generator, variance):
     one = torch.ones(count)
     return Estimates(
         torch.zeros((count, 3)), 0.9 * one, 2 * one, torch.ones((count, 3)),
-        variance[:, None].expand(-1, 3), 0 * one, 20 * one,
+        variance[:, None].expand(-1, 3), 0 * one, 20 * one, 0 * one, 10 * one,
         torch.ones(count, dtype=torch.long), torch.zeros(count, dtype=torch.int32),
     )  # fmt: skip
 
@@ -59,6 +59,20 @@ def test_calibration_finds_the_law_that_made_the_errors():
     weight = model.weight(found, beam)
     assert ((weight > 0) & (weight < 1)).all()
     assert (weight[inner][variance[inner].argsort()].diff() <= 1e-6).all()  # falls with the deviation
+
+
+def test_a_tracker_that_tells_its_correlation_alone_is_calibrated_by_it():
+    generator = torch.Generator().manual_seed(6)
+    unknown = torch.full((4000,), torch.nan)
+    found = estimates(4000, generator, unknown)
+    correlation = 0.5 + 0.49 * torch.rand(4000, generator=generator)
+    names = ("peak_ratio", "power", "snr", "response", "shear")
+    found = dataclasses.replace(found, correlation=correlation, **dict.fromkeys(names, unknown))
+    true = (1 - correlation)[:, None].expand(-1, 3)
+    beam = torch.tensor([[0.0, 0.0, 1.0]]).expand(4000, 3)
+    model = fit_calibration(found, true * torch.randn((4000, 3), generator=generator), beam)
+    inner = (correlation > 0.55) & (correlation < 0.95)
+    torch.testing.assert_close(model.sigma(found, beam)[inner], true[inner], rtol=0.25, atol=0)
 
 
 def test_weight_is_zero_where_an_estimate_is_flagged():
@@ -137,11 +151,46 @@ def test_doppler_measurements_of_a_recording(tmp_path):
     assert vector.beam is None and np.median(np.abs(error), axis=1).max() < 0.08
 
 
+def plane():
+    """Blood turning in an ellipse, two frames of a plane recording."""
+    surface = geometry.ellipse((7e-3, 9e-3), 1e-3, (0.0, 30e-3))
+    grid = geometry.Grid((-8e-3, 20e-3), (1e-3, 1e-3), (21, 17))
+    x, y = grid.nodes().numpy().T.reshape(2, *grid.shape)
+    mask = (x / 7e-3) ** 2 + ((y - 30e-3) / 9e-3) ** 2 < 0.9
+    velocity = np.stack([0.15 - 30 * (y - 30e-3), 0.2 + 30 * x]) * mask
+    wall = geometry.Wall(surface.vertices, surface.faces, surface.region)
+    return geometry.Recording(
+        time=np.array([0.0, 0.01]), grid=grid, velocity=np.stack([velocity] * 2).astype(np.float32),
+        mask=np.stack([mask] * 2), wall=wall, rho=1060.0, mu=4e-3,
+    )  # fmt: skip
+
+
+def test_a_plane_is_measured_along_parallel_beams_and_in_a_sector(tmp_path):
+    true, options = plane(), SpeckleOptions(training=4, every=2)
+    sector = dataclasses.replace(options, apex=(0.0, 0.0), depth=30e-3)
+    for chosen in (options, sector):
+        measured = measure_speckle(true, chosen, 0)
+        inner = measured.mask & (measured.weight > 0) & binary_erosion(measured.mask, np.ones((1, 5, 5), bool))
+        error = (measured.velocity - true.velocity[:1]).transpose(1, 0, 2, 3)[:, inner]
+        assert inner.sum() > 25 and np.median(np.abs(error), axis=1)[1] < 0.03
+        assert np.median(np.abs(error), axis=1)[0] < 0.15
+        geometry.write_recording(tmp_path / "plane.h5", measured)
+        assert geometry.read_recording(tmp_path / "plane.h5").dimension == 2
+    doppler = DopplerOptions(apex=(0.0, 0.0), depth=30e-3, every=2)
+    found = measure_doppler(true, doppler, 0)
+    beam = found.beam.reshape(2, -1).T
+    away = true.grid.nodes().numpy()
+    np.testing.assert_allclose(beam, away / np.linalg.norm(away, axis=1)[:, None], atol=1e-6)
+    seen = found.mask & (found.weight > 0) & binary_erosion(found.mask, np.ones((1, 5, 5), bool))
+    along = (true.velocity[:1] * found.beam).sum(1)
+    assert np.median(np.abs((found.velocity * found.beam).sum(1) - along)[seen]) < 0.03
+
+
 @pytest.mark.parametrize(("options", "message"), [
     ({"every": 0}, "every"), ({"image_spacing": 0.0}, "image_spacing"),
     ({"clutter_filter": "magic"}, "clutter_filter"),
     ({"snr": float("nan")}, "snr"), ({"packet": 4}, "9 taps"), ({"prf": -1.0}, "prf"),
-    ({"beam": (0.0, 0.0)}, "direction"),
+    ({"beam": (0.0, 0.0)}, "direction"), ({"apex": (0.0, 0.0), "beam": (0.0, 0.0, 1.0)}, "dimension"),
 ])  # fmt: skip
 def test_bad_scanner_options_are_refused_by_name(options, message):
     with pytest.raises(ValueError, match=message):
@@ -156,7 +205,7 @@ def test_a_beam_of_another_dimension_is_refused():
 @pytest.mark.slow
 def test_deviations_hold_in_each_third_of_the_weight_on_held_out_simulations():
     """z-scores have deviations of 0.8 to 1.25 in every third of the weight."""
-    model, tracker, spacing = EchoModel(), SpeckleTracker(), (1e-3 / 6,) * 3
+    model, tracker, spacing = EchoModel(), SpeckleTracker(max_snr=30.0), (1e-3 / 6,) * 3
     calibration = calibrate(model, tracker, spacing, torch.Generator().manual_seed(0))
     plan = TrainingPlan()
     points = training_points(plan, (0.0,) * 3)

@@ -1,8 +1,8 @@
-"""Speckle tracking: correlation by definition, peaks, accuracy on uniform motion, and the hard cases."""
+"""Speckle tracking: accuracy on uniform motion, and the hard cases."""
 
+import dataclasses
 import math
 
-import numpy as np
 import pytest
 import torch
 from ultrasound_cases import STEP, cube, lattice, packet
@@ -10,9 +10,8 @@ from ultrasound_cases import STEP, cube, lattice, packet
 from geometry import Grid
 from torchsph.ultrasound.acquisition import Acquisition, Beams, Packet
 from torchsph.ultrasound.clutter import FIRFilter
-from torchsph.ultrasound.correlation import KernelShape, correlate, image_pairs
+from torchsph.ultrasound.echoes import EchoModel, simulate_packet
 from torchsph.ultrasound.estimates import Flag
-from torchsph.ultrasound.peak import find_peak
 from torchsph.ultrasound.tracking import SpeckleTracker
 
 PLAIN = SpeckleTracker(clutter=None)
@@ -22,81 +21,9 @@ def flagged(estimates, flag):
     return (estimates.flags & int(flag)) != 0
 
 
-def random_volume(seed=0, dtype=torch.float64):
-    generator = torch.Generator().manual_seed(seed)
-    return torch.view_as_complex(torch.randn((20, 18, 16, 5, 2), generator=generator, dtype=dtype))
-
-
-def test_correlation_equals_its_definition_at_every_lag():
-    volume, shape = random_volume(), KernelShape((2, 1, 1), (1, 2, 1))
-    corner, offset = torch.tensor([[4, 5, 5], [8, 6, 7]]), torch.tensor([[0, 0, 0], [1, -1, 2]])
-    ramp = torch.tensor([[0.3, 0.0, -0.2], [0.0, 0.1, 0.0]], dtype=torch.float64)
-    rho = correlate(image_pairs(volume, 2, shape.half), corner, offset, shape, ramp=ramp)
-    for point in range(2):
-        z, y, x = corner[point].tolist()
-        place = [torch.arange(-h, h + 1, dtype=torch.float64) for h in shape.half]
-        turn = sum(g * n for g, n in zip(ramp[point], torch.meshgrid(*place, indexing="ij"), strict=True))
-        kernel = volume[z : z + 5, y : y + 3, x : x + 3, :-2] * torch.exp(2j * turn)[..., None]
-        for lag in np.ndindex(*shape.lags):
-            a, b, c = (
-                n + o + k - s
-                for n, o, k, s in zip((z, y, x), offset[point].tolist(), lag, shape.search, strict=True)
-            )
-            other = volume[a : a + 5, b : b + 3, c : c + 3, 2:]
-            exact = (kernel.conj() * other).sum() / (kernel.norm() * other.norm())
-            assert abs(complex(rho[(point, *lag)]) - complex(exact)) < 1e-12
-
-
-def test_a_silent_kernel_correlates_with_nothing():
-    volume = torch.zeros((20, 18, 16, 3), dtype=torch.complex64)
-    shape = KernelShape((1,) * 3, (1,) * 3)
-    pairs = image_pairs(volume, 1, shape.half)
-    rho = correlate(pairs, torch.tensor([[5, 5, 5]]), torch.zeros((1, 3), dtype=torch.long), shape)
-    assert not rho.abs().any()
-
-
-def gaussian_peak(curve, vertex, lags):
-    """0.9 exp(-quadratic) with second derivatives -curve of its logarithm, times a phase."""
-    axis = torch.arange(-(lags // 2), lags // 2 + 1, dtype=torch.float64)
-    offset = (
-        torch.stack(torch.meshgrid(*[axis] * len(vertex), indexing="ij"), -1) - torch.tensor(vertex).double()
-    )
-    height = 0.9 * torch.exp(-0.5 * torch.einsum("...a,ab,...b->...", offset, curve, offset))
-    return (height * np.exp(0.7j))[None]
-
-
-CURVE = torch.tensor([[0.04, 0.01, 0.0], [0.01, 0.03, 0.01], [0.0, 0.01, 0.05]], dtype=torch.float64)
-
-
-@pytest.mark.parametrize("axes", [2, 3])
-@pytest.mark.parametrize("vertex", [(0.3, -0.4, 0.2), (-1.3, 0.9, 0.1), (2.3, 0.0, 0.0)])
-def test_peak_of_a_gaussian_is_exact_also_beyond_the_rim(axes, vertex):
-    curve = CURVE[:axes, :axes]
-    peak = find_peak(gaussian_peak(curve, vertex[:axes], 5))
-    np.testing.assert_allclose(peak.lag[0].numpy(), vertex[:axes], atol=1e-9)
-    np.testing.assert_allclose(peak.hessian[0].numpy(), -curve.numpy(), atol=1e-9)
-    assert complex(peak.value[0]) == pytest.approx(0.9 * np.exp(0.7j), abs=0.01)  # from a parabola of its own
-    assert bool(peak.concave)
-
-
-def test_a_peak_on_a_given_plane_is_the_highest_there():
-    curve = torch.tensor([[0.10, 0.04], [0.04, 0.08]], dtype=torch.float64)
-    peak = find_peak(gaussian_peak(curve, (0.1, 0.2), 3))
-    direction = torch.tensor([[1.0, 0.0]], dtype=torch.float64)
-    found = peak.constrained(direction, torch.tensor([0.4], dtype=torch.float64))
-    # with the first lag 0.3 off the vertex the second follows by -curve01 / curve11 times that
-    np.testing.assert_allclose(found[0].numpy(), [0.4, 0.2 - 0.5 * 0.3], atol=1e-9)
-
-
-def test_two_separate_peaks_are_told_by_their_ratio():
-    rho = torch.full((1, 7, 7), 0.1, dtype=torch.complex128)
-    rho[0, 2, 2], rho[0, 5, 5] = 0.8, 0.4
-    assert float(find_peak(rho).ratio) == pytest.approx(2)
-
-
 @pytest.mark.parametrize("velocity", [(0.31, 0.17, 0.23), (-0.62, 0.44, 0.51)])
 def test_uniform_motion_is_measured_within_the_stated_error(velocity):
-    """Targets: |bias| <= 1 % of the speed, deviation <= 5 % lateral and 1 % axial of 1 m/s."""
+    """|bias| <= 1 % of the speed, deviation about 2 % lateral and 0.1 % axial of 1 m/s."""
     points, errors = lattice(), []
     for seed in range(3):
         found = PLAIN.track(packet(velocity, seed), points)
@@ -104,7 +31,7 @@ def test_uniform_motion_is_measured_within_the_stated_error(velocity):
         errors.append(found.velocity[found.accepted] - torch.tensor(velocity))
     error = torch.cat(errors)
     deviation = error.std(0)
-    assert (deviation[:2] < 0.03).all() and deviation[2] < 2e-3
+    assert (deviation[:2] < 0.022).all() and deviation[2] < 1.2e-3
     speed = math.hypot(*velocity)
     assert (error.mean(0).abs() < 0.01 * speed + 0.003).all()  # 375 points, some 60 of them independent
 
@@ -189,6 +116,43 @@ def test_clutter_of_sixty_decibel_is_filtered_away():
     assert found.power.median() < -50
 
 
+@dataclasses.dataclass(frozen=True)
+class BesideTissue:
+    """Blood moves for x < 0; beyond is tissue that creeps along the beam."""
+
+    velocity_of_blood: tuple
+    creep: float = 2e-3
+
+    def blood(self, points, time):
+        return points[:, 0] < 0
+
+    def velocity(self, points, time):
+        still = points.new_tensor((0.0, 0.0, self.creep))
+        return torch.where(self.blood(points, time)[:, None], points.new_tensor(self.velocity_of_blood), still)
+
+
+def test_blood_beside_tissue_of_sixty_decibel():
+    """Far from it blood is tracked, at its edge and inside it nothing is believed."""
+    flow, points = BesideTissue((0.1, 0.2, 0.25)), lattice(half=3)
+    scene = simulate_packet(
+        flow, cube(24), EchoModel(tissue=60.0), 0.0, torch.Generator().manual_seed(9), dtype=torch.float64
+    )
+    found = SpeckleTracker(max_snr=30.0, min_blood=-80.0).track(scene, points)
+    far, beyond = points[:, 0] < -2.5e-3, points[:, 0] > 0.5e-3
+    error = (found.velocity - flow.velocity(points, 0.0))[far & found.accepted]
+    assert found.accepted[far].double().mean() > 0.8 and not found.accepted[beyond].any()
+    assert error[:, 2].abs().median() < 0.01 and error[:, :2].abs().median() < 0.1
+
+
+def test_a_kernel_without_scatterers_is_flagged_alone():
+    scene, points = packet((0.2, 0.1, 0.1), 10, snr=None), lattice()
+    hole = (scene.grid.nodes() - torch.tensor([0.0, 0.0, 24e-3])).abs().amax(1) < 0.7e-3
+    found = PLAIN.track(scene.with_iq(torch.where(hole.view(scene.grid.shape), 0, scene.iq)), points)
+    empty = (points - torch.tensor([0.0, 0.0, 24e-3])).abs().amax(1) < 0.1e-3
+    assert flagged(found, Flag.WEAK).tolist() == empty.tolist()
+    assert found.accepted[~empty].float().mean() > 0.6 and not found.velocity[empty].any()
+
+
 def test_no_scatterers_and_a_constant_image_are_flagged():
     grid, points = cube(12), lattice(half=1)
     for value in (0.0, 1.0):
@@ -242,3 +206,12 @@ def test_options_are_checked():
     ):
         with pytest.raises(ValueError, match=message):
             SpeckleTracker(**options)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device: the echo chain is tested on the CPU only")
+def test_the_chain_runs_on_a_cuda_device():
+    flow, points = BesideTissue((0.1, 0.2, 0.25)), lattice(half=1) - torch.tensor([3e-3, 0.0, 0.0])
+    scene = simulate_packet(flow, cube(24), EchoModel(), 0.0, torch.Generator("cuda").manual_seed(0))
+    there = SpeckleTracker().track(scene, points.cuda())
+    here = SpeckleTracker().track(dataclasses.replace(scene, iq=scene.iq.cpu()), points)
+    torch.testing.assert_close(there.velocity.cpu(), here.velocity, atol=2e-3, rtol=0)

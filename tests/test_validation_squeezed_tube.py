@@ -16,7 +16,7 @@ SPACING, RADIUS, LENGTH, TIME = 1e-3, 8e-3, 16e-3, 0.02
 END = 2
 
 
-def squeezed(name, rate):
+def squeezed(name, rate, pressure=None):
     """A run after ``TIME`` from the exact flow, with the walls' strain rate a = ``rate`` (1/s); exact velocities."""
     tube = geometry.tube(RADIUS, LENGTH, SPACING)
     at_end = (tube.centroids[:, 2] > LENGTH - 1e-9) & (tube.normals[:, 2] > 0.9)
@@ -26,7 +26,8 @@ def squeezed(name, rate):
         times, places, tube.faces, np.where(at_end, END, 0).astype(np.uint8), rates=places * np.array([rate, rate, 0.0])
     )
     scene = Scene(
-        spacing=SPACING, fluid=Fluid(1000.0, 0.0), walls=walls, valves=(Valve(END, ((0.0, 1.0),)),), reference_speed=0.2
+        spacing=SPACING, fluid=Fluid(1000.0, 0.0), walls=walls, reference_speed=0.2,
+        valves=(Valve(END, ((0.0, 1.0),), pressure=pressure),),
     )  # fmt: skip
     run = Simulator(scene, preset(name, wall=CompleteKernelWall(no_slip=False))).start(0.0)
 
@@ -41,7 +42,7 @@ def squeezed(name, rate):
     return run, exact()
 
 
-@pytest.mark.parametrize(("name", "bound"), [("projection", 0.08), ("default", 0.17)])
+@pytest.mark.parametrize(("name", "bound"), [("projection", 0.06), ("default", 0.15)])
 def test_a_squeezed_tube_flows_out_as_it_must(name, bound):
     """Velocity everywhere against the exact one; the weakly compressible fluid rings, at a fifth of usual speeds."""
     run, exact = squeezed(name, -4.0)
@@ -54,13 +55,31 @@ def test_a_squeezed_tube_flows_out_as_it_must(name, bound):
     assert int(run.record.crossed_wall.sum()) == 0 and int(run.record.outside.sum()) == 0
 
 
-def test_a_widened_tube_is_filled_as_it_must():
-    run, exact = squeezed("projection", 4.0)
+@pytest.mark.parametrize("name", ["projection", "default"])
+def test_a_widened_tube_is_filled_as_it_must(name):
+    run, exact = squeezed(name, 4.0)
     p = run.particles
     deep = p.inside & (p.position[:, 2] < 0.5 * LENGTH / SPACING)
-    assert float((p.velocity - exact)[deep].norm() / exact[deep].norm()) < 0.12
+    assert float((p.velocity - exact)[deep].norm() / exact[deep].norm()) < 0.09
     volume = run.domain.fluid_volume(TIME) / SPACING**3
     assert float(p.mass[p.inside].sum()) == pytest.approx(volume, rel=0.02)
+    assert int(run.record.outside.sum()) == 0 and not bool(run.record.failed.any())
+
+
+@pytest.mark.parametrize(
+    ("name", "rate", "bound"),
+    [("projection", -4.0, 0.06), ("default", -4.0, 0.08), ("projection", 4.0, 0.08), ("default", 4.0, 0.12)],
+)
+def test_an_end_at_a_given_pressure_passes_what_the_volume_demands(name, rate, bound):
+    """Nothing but the walls drives the flow, and it is as exact as with a prescribed flux, or more so.
+
+    Measured 4.3, 5.6, 6.0 and 9.2 %; with the flux of dV/dt 3.6, 13.7, 7.8 and 34 % at the same places.
+    """
+    run, exact = squeezed(name, rate, 0.0)
+    p = run.particles
+    where = p.inside if rate < 0 else p.inside & (p.position[:, 2] < 0.5 * LENGTH / SPACING)
+    assert float((p.velocity - exact)[where].norm() / exact[where].norm()) < bound
+    assert float(run.record.filling) == pytest.approx(1.0, abs=0.04)
     assert int(run.record.outside.sum()) == 0 and not bool(run.record.failed.any())
 
 

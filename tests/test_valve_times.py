@@ -35,6 +35,9 @@ def test_a_recordings_valves_go_on_with_its_beat():
     scene = Scene.from_recording(replace(recording, period=VENTRICLE.beat.period), 3e-3)
     period = scene.walls.period
     assert period > 0 and scene.valves
+    seen = replace(recording, period=VENTRICLE.beat.period, valve_intervals=None)  # open at the end: until it ends
+    for valve in Scene.from_recording(seen, 3e-3).valves:
+        assert np.isfinite(valve.intervals).all() and valve.is_open(0.3) == valve.is_open(0.3 + period)
     for valve in scene.valves:
         assert valve.period == period
         for time in np.linspace(0.01, period, 40):

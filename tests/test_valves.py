@@ -44,6 +44,11 @@ def test_the_open_valve_passes_what_the_volume_demands(scene, start, stop):
     layer = 12 * float(p.mass.mean()) * unit
     assert abs(volume - VENTRICLE.volume(stop)) < layer
     assert abs(change) > 5 * layer
+    assert float(run.record.cavity_change) == pytest.approx(change, rel=0.01)  # of the mesh
+    passed = run.record.inflow - run.record.outflow
+    assert abs(float(passed.sum() - run.record.cavity_change)) < layer + abs(1 - float(run.record.filling)) * volume
+    silent = passed[0, 1] if change > 0 else passed[0, 0]  # each valve's own flux: the other is shut
+    assert float(silent) == 0.0
     assert not run.record.failed.any()
     assert int(run.record.crossed_wall.sum()) < 0.02 * p.count
     assert int(run.record.outside.sum()) == 0

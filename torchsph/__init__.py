@@ -5,7 +5,8 @@ and an ensemble filter joins forecasts and measurements.
 """
 
 from ._version import __version__
-from .ensemble import EnsembleOptions, EnsembleRun, assimilate, default_filter
+from .ensemble import EnsembleRun, assimilate, default_filter
+from .ensemble_options import EnsembleOptions, Estimated
 from .forecast import ForecastSkill, GridForecast, Transfer, skill
 from .incompressible import Projection
 from .observation_error import ObservationError, estimate_error
@@ -32,7 +33,7 @@ from .smoothing import KERNELS, SmoothingKernel, kernel
 
 __all__ = [
     "DEFAULT_METHOD", "KERNELS", "METHODS", "PRESETS", "XSPH", "CompleteKernelWall", "EnsembleOptions",
-    "EnsembleRun", "FilteredRun", "Fluid", "ForecastSkill", "GammaRamp", "GridForecast", "MethodResult",
+    "EnsembleRun", "Estimated", "FilteredRun", "Fluid", "ForecastSkill", "GammaRamp", "GridForecast", "MethodResult",
     "NumericalFailure", "ObservationError", "PopulationControl", "PotentialWall", "PressureSource", "Projection",
     "Reservoir", "ResidualMotion", "Rollback", "Scene", "Seeding", "Simulation", "Simulator", "SmoothingKernel",
     "Transfer", "Valve", "WeaklyCompressible", "__version__", "assimilate", "default_filter", "estimate_error",

@@ -58,9 +58,19 @@ def _assimilate(parser: Parser, presets: tuple[str, ...]) -> None:
         "measurement", nargs="?", metavar="MEASUREMENT.h5", help="a recording with /weight or /sigma"
     )
     parser.add_argument("--truth", metavar="TRUTH.h5", help="the true flow, to compute errors against")
-    parser.add_argument("--method", type=names, metavar="NAME[,NAME]", help="spline, sph, ensemble")
+    parser.add_argument("--method", type=names, metavar="NAME[,NAME]", help="free, spline, sph, ensemble")
+    parser.add_argument(
+        "--also",
+        action="append",
+        default=[],
+        metavar="FILE.h5",
+        help="a further measurement of the same beat, with its own grid, times and errors (repeatable)",
+    )
     _model(parser, presets)
     parser.add_argument("--members", type=whole(2), metavar="N", help="size of the ensemble")
+    parser.add_argument(
+        "--resume", action="store_true", help="go on with the ensemble where DIR/checkpoint.pt left it"
+    )
     parser.add_argument(
         "--seed", type=whole(0), default=0, metavar="S", help="of everything random (%(default)s)"
     )
@@ -110,6 +120,9 @@ def _measure(parser: Parser, _: tuple[str, ...]) -> None:
     echoes.add_argument("--snr", type=number(-100), metavar="DB", help="of the blood's echoes")
     echoes.add_argument("--prf", type=number(0, open_below=True), metavar="HZ", help="pulses per second")
     echoes.add_argument("--packet", type=whole(2), metavar="N", help="frames of echoes per estimate")
+    echoes.add_argument(
+        "--apex", type=float, nargs="+", metavar="M", help="x, y, z: beams fan out from there; else parallel"
+    )
     echoes.add_argument("--clutter", type=number(0), metavar="DB", help="tissue over blood inside the cavity")
     parser.add_argument(
         "--seed", type=whole(0), default=0, metavar="N", help="of everything random (%(default)s)"

@@ -15,50 +15,71 @@ import numpy as np
 import torch
 
 import geometry
-from torchsph import data, metrics, pipeline, report
+from torchsph import data, metrics, parallel, pipeline, report
 from torchsph._version import __version__
 from torchsph.arguments import LEADS
+from torchsph.assimilation import filter_figure
 from torchsph.outputs import output_folder, staged, write_json
 from torchsph.smooth import smooth as smooth_recording
 
 __all__ = ["COMMANDS"]
 
-MEASURE_FLAGS = ("every", "lateral", "axial", "outliers", "snr", "prf", "packet", "clutter")
+MEASURE_FLAGS = ("every", "lateral", "axial", "outliers", "snr", "prf", "packet", "clutter", "apex")
 
 
 def assimilate(args: argparse.Namespace) -> None:
-    """`torchsph assimilate`: every asked method on one measurement, scored, drawn and written."""
+    """`torchsph assimilate`: every asked method on one measurement, scored, drawn and written.
+
+    Under torchrun the processes share the ensemble's simulations; the first one writes and prints.
+    """
     measured_path, truth_path, methods = _assimilate_inputs(args)
-    folder, device = output_folder(args.out), _device(args.device)
-    measured = _full_vectors(geometry.read_recording(measured_path), measured_path)
+    folder, device = output_folder(args.out), parallel.own_device(_device(args.device))
+    measured = geometry.read_recording(measured_path)
+    also = [geometry.read_recording(path) for path in args.also]
     truth = None if truth_path is None else geometry.read_recording(truth_path)
     _check_spacing(args.spacing, measured)
     scores = {
         "raw": metrics.evaluate(measured, truth, measured)
     }  # first: a truth that does not fit must not cost a run
-    results = pipeline.run_methods(
-        measured,
-        methods,
-        preset=args.preset,
-        spacing=args.spacing,
-        members=args.members,
-        seed=args.seed,
-        device=device,
-        progress=True,
-    )
+    saved = folder / "checkpoint.pt"
+    with parallel.joined():
+        results = pipeline.run_methods(
+            measured,
+            methods,
+            preset=args.preset,
+            spacing=args.spacing,
+            members=args.members,
+            also=also,
+            truth=truth,
+            checkpoints=saved,
+            resume=args.resume,
+            seed=args.seed,
+            device=device,
+            progress=parallel.is_lead(),
+        )
+    if not parallel.is_lead():
+        return
     analyses = {name: result.recording for name, result in results.items()}
     scores |= {name: metrics.evaluate(recording, truth, measured) for name, recording in analyses.items()}
     seconds = {name: result.seconds for name, result in results.items()}
     chosen = pipeline.DEFAULT_METHOD if pipeline.DEFAULT_METHOD in methods else methods[0]
     config = _config(args, measured=measured_path, truth=truth_path, methods=methods, analysis=chosen)
     config["info"] = {name: result.info for name, result in results.items()}
+    if truth is not None:
+        claims = {name: metrics.spread_over_skill(recording, truth) for name, recording in analyses.items()}
+        config["spread_over_skill"] = {name: claim.value for name, claim in claims.items() if claim is not None}
     with staged(folder) as scratch:
         for name, recording in analyses.items():
             geometry.write_recording(scratch / f"{name}.h5", recording)
         shutil.copyfile(scratch / f"{chosen}.h5", scratch / "analysis.h5")
         report.draw_report(scratch / "report.png", measured, analyses, scores, truth, seconds)
+        if "ensemble" in results:
+            filter_figure(results["ensemble"].info["filter"]).savefig(scratch / "filter.png", dpi=110)
         write_json(scratch / "metrics.json", metrics_document(measured, scores, seconds, config))
+    saved.unlink(missing_ok=True)  # the run is complete: there is nothing to go on with
     _print_table(report.scores_table(scores, seconds))
+    for words in results["ensemble"].info["filter"]["warnings"] if "ensemble" in results else ():
+        _say(f"ensemble: {words}")
     _say(f"wrote {', '.join(f'{name}.h5' for name in analyses)}, analysis.h5 (= {chosen}.h5), report.png and "
          f"metrics.json to {folder}/")  # fmt: skip
 

@@ -19,6 +19,7 @@ from .schemes import CompleteKernelWall, PressureSource, Reservoir
 from .smoothing import kernel
 from .transfer import fill_beyond
 from .units import Units
+from .wall_pass import near_wall
 from .wallfield import WallFields
 from .walls import WallSample
 from .work import energy_unit
@@ -157,6 +158,16 @@ class Domain:
         """Set the present time of the members, s: (members,) float64 or one for all."""
         self._times = torch.as_tensor(times, dtype=torch.float64, device=self.device)
 
+    @property
+    def now(self) -> float:
+        """Present time, s, on the average over the members."""
+        return float(self._times.mean())
+
+    def later(self, particles: Particles, step: Tensor) -> Particles:
+        """Go on by ``step`` (members,), internal; the particles with what buffers do at that time."""
+        self.at(self.member_times(particles.members) + step.double() * self.units.time)
+        return self.reservoirs.driven(particles) if self.reservoirs is not None and self._open else particles
+
     def time_of(self, particles: Particles) -> Tensor:
         """Present time of each particle's member, s, (N,) float64."""
         return self.member_times(particles.members).index_select(0, particles.member)
@@ -193,6 +204,10 @@ class Domain:
         if push is None or total is None:
             return total if push is None else push
         return total + push
+
+    def shortfall(self, particles: Particles) -> Tensor:
+        """By how much (N,), per time, the volume of a member's particles should grow to fill the cavity."""
+        return per_particle(self.reservoirs.shortfall(particles), particles.member)
 
     def _gravity(self, particles: Particles) -> Tensor | None:
         """Gravity at the particles' present times (N, D) or None."""
@@ -243,15 +258,14 @@ class Domain:
             after = self.reservoirs.driven(after)
         if wall is None or not isinstance(self.scheme.wall, CompleteKernelWall):
             return after
-        dt = per_particle(step, after.member)
-        moved = after.position - before.position - dt[:, None] * wall.velocity
-        distance = wall.distance + (moved * wall.normal).sum(1)
         gap = self.scheme.wall.gap
         # few particles are that close: the rest is for them alone
-        near = torch.nonzero((distance < gap) & after.fluid).squeeze(1)
+        near, distance = near_wall(
+            before.position, after.position, wall, step, after.member, after.fluid, gap
+        )
         if near.numel() == 0:
             return after
-        distance, normal = distance[near], wall.normal[near]
+        normal = wall.normal[near]
         record.crossed_wall.index_add_(0, after.member[near], (distance < 0).to(torch.int64))
         velocity = after.velocity[near]
         towards = ((velocity - wall.velocity[near]) * normal).sum(1).clamp_max(0.0)
@@ -294,14 +308,16 @@ class Domain:
                 beyond |= self.sources.behind(position, region, self.middle)
         return beyond
 
-    def account(self, particles: Particles, record: Record, time: float) -> None:
-        """Count the particles that are beyond the walls now."""
+    def account(self, particles: Particles, record: Record, time: float, since: float) -> None:
+        """Count the particles beyond the walls now, at ``time`` (s), and the volumes; the run began at ``since``."""
         self.at(time)
         wall = self.sample(particles)
         if wall is not None:
             beyond = (wall.distance < -_OUTSIDE) & particles.fluid
             record.outside = particles.per_member(beyond.to(torch.int64), "sum")
             record.filling = self.filling(particles, time)
+            if self.scene.walls.moves:
+                record.cavity_change.fill_(self.fluid_volume(time) - self.fluid_volume(since))
 
     def imposed(self, particles: Particles, grid: Grid, velocity: Tensor, mask: Tensor, time: float) -> Particles:
         """Particles with the velocity of a grid field, continued beyond its mask by the walls' velocity."""

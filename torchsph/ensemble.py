@@ -1,60 +1,27 @@
-"""The ensemble filter over a recording: forecast all members in one batch, analyse each frame, go on."""
+"""The ensemble filter over a recording: forecast control and members, analyse each frame, learn, go on."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
 
 import numpy as np
-import torch
-from torch import Tensor
 from tqdm import tqdm
 
 import geometry
 import regularize
 
-from .assimilation import LETKF, RTPS, Analysis, Filter, HybridGain, Localisation, Observations, replace_failed
-from .forecast import GridForecast, Transfer
+from . import checkpoint
+from .assimilation import LETKF, RTPS, Filter, Localisation
+from .cycle import Cycle
+from .ensemble_options import EnsembleOptions
+from .members import Forecaster
 from .observation_error import ObservationError, estimate_error
-from .perturbations import flow_perturbations
+from .observing import Source
 from .simulator import Simulator
-from .smooth import FrameSmoother, node_weights, smooth_frames
-
-
-@dataclass(frozen=True)
-class EnsembleOptions:
-    """Settings of the cycle; lengths and speeds are relative to the scene, so that hearts of any size fit.
-
-    Attributes:
-        initial_spread: RMS per component of the first perturbations, share of the first field's RMS per component.
-        model_error: the same for the perturbations added to every forecast, share of the RMS of the forecast's mean
-            or of all splines, whichever is larger.
-        length: correlation length of both, in mean grid spacings.
-        localisation: radius at which observations lose all influence, share of the walls' longest extent.
-        relaxation: RTPS factor. gross_error: rejection limit in expected standard deviations, or None.
-        spline_share: weight of the spline-space analysis in the hybrid gain; 0 leaves the LETKF alone.
-        choose_every: frames after which the smoothness of the innovations is chosen anew.
-        memory: frames over which the observation error is averaged that the innovations show.
-        transfer: how grid forecasts are put together.
-    """
-
-    initial_spread: float = 0.35
-    model_error: float = 0.2
-    length: float = 2.0
-    localisation: float = 0.33
-    relaxation: float = 0.5
-    gross_error: float | None = None
-    spline_share: float = 0.5
-    choose_every: int = 3
-    memory: float = 5.0
-    transfer: Transfer = Transfer()
-
-    def __post_init__(self) -> None:
-        for name in ("initial_spread", "length", "localisation", "memory"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"EnsembleOptions.{name} must be positive, got {getattr(self, name)}")
-        for name in ("model_error", "relaxation", "spline_share"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise ValueError(f"EnsembleOptions.{name} must lie in [0, 1], got {getattr(self, name)}")
+from .smooth import FrameSmoother, smooth_frames
 
 
 @dataclass(frozen=True)
@@ -62,7 +29,7 @@ class EnsembleRun:
     """The analyses of a recording, with the standard deviation the filter claims, and the accounts."""
 
     recording: geometry.Recording
-    info: dict[str, object]
+    info: dict[str, Any] = field(default_factory=dict)
 
 
 def default_filter(measured: geometry.Recording, options: EnsembleOptions) -> LETKF:
@@ -76,189 +43,131 @@ def default_filter(measured: geometry.Recording, options: EnsembleOptions) -> LE
 
 def assimilate(
     measured: geometry.Recording, model: Simulator, *, members: int = 16, filter: Filter | None = None,
-    options: EnsembleOptions | None = None, splines: FrameSmoother | None = None,
-    smoothed: geometry.Recording | None = None, seed: int = 0, progress: bool = False,
+    options: EnsembleOptions | None = None, coarse: Simulator | None = None,
+    also: Sequence[geometry.Recording] = (), splines: FrameSmoother | None = None,
+    smoothed: geometry.Recording | None = None, error: ObservationError | None = None,
+    truth: geometry.Recording | None = None, checkpoints: str | Path | None = None, resume: bool = False,
+    seed: int = 0, progress: bool = False,
 ) -> EnsembleRun:
-    """Assimilate a measurement into an ensemble of SPH simulations.
+    """Assimilate measurements into an ensemble of SPH simulations.
 
-    The first frame's spline, perturbed, makes the ensemble. Every cycle imposes the members' grids on particles,
-    advances all of them in one batch to the next frame, fetches the grids, perturbs them with model error and lets
-    the filter update them with the frame. With ``spline_share`` the mean moves towards a second analysis: the forecast
-    mean plus the penalised spline of the innovation (hybrid gain).
+    The first frame's spline is the control, draws from its posterior make the members. Every cycle imposes the grids
+    on particles, advances the control in ``model`` and the members in ``coarse`` to the next frame and fetches the
+    grids. What the measurement would see of them (blurred by its kernel, on its grid, along its beam) is compared with
+    what it saw, and two analyses of the difference are made: a penalised spline of the innovations and a localised
+    ensemble filter. How far each is followed is learned from whether the next innovations are still correlated with
+    it (``LearnedGain``); how large the spread must be, from what the analysis took over (``SpreadMatch``); how wrong
+    the observations are, from what is left (``ErrorScale``).
 
     Args:
-        measured: the recording. model: simulator of its scene. members: at least 2.
+        measured: its grid, mask, walls and times are those of the analysis. model: simulator of its scene.
+        members: at least 2.
         filter: any ``torchsph.assimilation`` filter; None takes ``default_filter``.
-        splines: of the first field and the spline-space analysis. smoothed: their result, where it is there already.
-        seed: of everything random.
+        coarse: simulator of the members; None: ``model``.
+        also: further measurements of the same beat, each with its own grid, times and errors; a frame is compared with
+            the forecast at its own time and enters the next analysis.
+        splines: of ``measured``; smoothed: their result; error: its error model; where they are there already.
+        truth: for the scores in the record alone. It never enters an analysis.
+        checkpoints: file to which every cycle writes its state. resume: go on from it where it is there.
+        seed: of everything random. Under ``torch.distributed`` the processes share the simulations; the result is the
+            same for any number of them.
 
     Raises:
-        ValueError: fewer than two members. NumericalFailure: all members failed.
+        ValueError: fewer than two members, or a checkpoint of another run. NumericalFailure: all simulations failed.
     """
     if members < 2:
         raise ValueError(f"an ensemble needs at least 2 members, got {members}")
+    if resume and checkpoints is None:
+        raise ValueError("resume needs the file of checkpoints that the run before wrote")
     options = EnsembleOptions() if options is None else options
+    coarse = model if coarse is None else coarse
+    filter = default_filter(measured, options) if filter is None else filter
     splines = FrameSmoother(measured, regularize.Smoother()) if splines is None else splines
-    smoothed = smooth_frames(splines, progress) if smoothed is None else smoothed
-    cycle = _Cycle(model, members, filter or default_filter(measured, options), options, splines,
-                   estimate_error(measured, splines, smoothed), torch.Generator().manual_seed(seed))
-    cycle.begin(smoothed)
-    frames = tqdm(range(1, measured.frames), desc="ensemble", unit="frame", disable=None if progress else True)
-    for frame in frames:
-        cycle.step(frame, seed)
-    return cycle.result(members)
+    if error is None:
+        error = estimate_error(measured, splines, smooth_frames(splines, progress) if smoothed is None else smoothed)
+    sources = [Source(measured, error, measured.grid, options.kernel)]
+    sources += [_other(one, measured, options, progress) for one in also]
+    cycle = Cycle(
+        sources, splines, Forecaster(model, coarse, measured.grid, options.transfer, batch=options.batch, seed=seed),
+        filter, options, members=members, usual=_usual_speed(measured, splines, smoothed), truth=truth, seed=seed,
+    )
+    key = checkpoint.fingerprint(_identity(measured, also, model, coarse, filter, options, members, seed))
+    path = None if checkpoints is None else Path(checkpoints)
+    state = checkpoint.load(path, key) if resume else None
+    if state is not None:
+        cycle.restore(state)
+    _run(cycle, path, key, progress)
+    return EnsembleRun(_as_recording(cycle), _accounts(cycle))
 
 
-class _Cycle:
-    """State of the filter on its way through the frames."""
+def _run(cycle: Cycle, path: Path | None, key: str, progress: bool) -> None:
+    frames = range(cycle.done, cycle.measured.frames)
+    for frame in tqdm(frames, desc="ensemble", unit="frame", disable=None if progress else True):
+        if frame == 0:
+            cycle.begin()
+        else:
+            cycle.step(frame)
+        if path is not None:
+            checkpoint.save(path, key, cycle.state())
 
-    def __init__(
-        self, model: Simulator, members: int, filter_: Filter, options: EnsembleOptions, splines: FrameSmoother,
-        error: ObservationError, generator: torch.Generator,
-    ) -> None:
-        measured = splines.recording
-        self.measured, self.model, self.members, self.filter = measured, model, members, filter_
-        self.options, self.error, self.generator = options, error, generator
-        self.splines, self.increment_choice = splines, None
-        self.grid = measured.grid
-        self.nodes = self.grid.nodes()
-        self.length = options.length * float(np.mean(self.grid.spacing))
-        self.scale = np.ones(measured.dimension)
-        self.fields: list[np.ndarray] = []
-        self.sigmas: list[np.ndarray] = []
-        self.missing: list[int] = []
-        self.frames_info: list[dict[str, object]] = []
-        self.replaced = 0
 
-    def mask(self, frame: int) -> np.ndarray:
-        return np.array(self.measured.mask[frame], bool)
-
-    def begin(self, smoothed: geometry.Recording) -> None:
-        mask = self.mask(0)
-        mean = torch.from_numpy(np.where(mask, smoothed.velocity[0], 0.0))
-        inside = np.moveaxis(smoothed.velocity, 1, -1)[np.asarray(smoothed.mask, bool)]
-        self.usual = float(np.sqrt(np.mean(np.square(inside, dtype=np.float64))))
-        self.ensemble = mean + self._perturbations(0, mean, self.options.initial_spread)
-        self._keep(mean.numpy(), self.ensemble.std(0).numpy(), 0)
-
-    def _perturbations(self, frame: int, mean: Tensor, share: float, least: float = 0.0) -> Tensor:
-        mask = self.mask(frame)
-        rms = max(float(mean[:, torch.from_numpy(mask)].square().mean().sqrt()), least)
-        return flow_perturbations(
-            self.members, mask, self.grid.spacing, share * rms, self.length, self.generator
-        ).to(mean.dtype)
-
-    def step(self, frame: int, seed: int) -> None:
-        early, late = torch.from_numpy(self.mask(frame - 1)), torch.from_numpy(self.mask(frame))
-        going = GridForecast(
-            self.model, self.grid, self.ensemble.to(self.model.device), early.to(self.model.device),
-            float(self.measured.time[frame - 1]), self.options.transfer, seed=seed,
+def _other(
+    recording: geometry.Recording, measured: geometry.Recording, options: EnsembleOptions, progress: bool
+) -> Source:
+    """A further measurement with its own error model, for the state of the first."""
+    if recording.dimension != measured.dimension:
+        raise ValueError(
+            f"a further measurement has {recording.dimension} dimensions, the first one {measured.dimension}"
         )
-        value, covered = going.at(float(self.measured.time[frame]), late.to(self.model.device))
-        forecast = value.cpu().to(torch.float32)
-        failed = going.run.record.failed.cpu()
-        if bool(failed.any()):
-            forecast = replace_failed(forecast.flatten(1), failed, generator=self.generator).ensemble.reshape(
-                forecast.shape
-            )
-            self.replaced += int(failed.sum())
-        if self.options.model_error > 0:
-            forecast = forecast + self._perturbations(frame, forecast.mean(0), self.options.model_error, self.usual)
-        self._analyse(forecast, frame, int((late & ~covered[0].cpu()).sum()))
+    splines = FrameSmoother(recording, regularize.Smoother())
+    error = estimate_error(recording, splines, smooth_frames(splines, progress))
+    return Source(recording, error, measured.grid, options.kernel)
 
-    def _analyse(self, forecast: Tensor, frame: int, missing: int) -> None:
-        mask = self.mask(frame)
-        inside = torch.from_numpy(np.flatnonzero(mask))
-        state = forecast.flatten(2)[:, :, inside].flatten(1)
-        observations = self._observations(frame, inside)
-        acting = self.filter
-        if self.options.spline_share > 0:
-            acting = HybridGain(filter=self.filter, second=self._spline_analysis(frame, inside),
-                                weight=self.options.spline_share)
-        analysis = acting.analyse(
-            state, state, observations, state_positions=self.nodes[inside], generator=self.generator
-        )
-        self._learn_scale(analysis, state)
-        shape = (self.members, self.measured.dimension, self.grid.size)
-        full = torch.zeros(shape, dtype=state.dtype)
-        full[:, :, inside] = analysis.ensemble.reshape(self.members, shape[1], -1)
-        self.ensemble = full.reshape(forecast.shape)
-        sigma = torch.zeros(shape[1:], dtype=state.dtype)
-        sigma[:, inside] = analysis.variance.clamp_min(0).sqrt().reshape(shape[1], -1)
-        field = torch.zeros(shape[1:], dtype=state.dtype)
-        field[:, inside] = analysis.mean.reshape(shape[1], -1)
-        self._keep(field.reshape(shape[1], *self.grid.shape).numpy(),
-                   sigma.reshape(shape[1], *self.grid.shape).numpy(), missing)
-        normalised = analysis.normalised_innovation()
-        self.frames_info.append({
-            "time": float(self.measured.time[frame]), "observations": analysis.counts(),
-            "normalised_innovation": float(normalised[analysis.reason == 0].square().mean().sqrt()),
-            "spread_before": float(analysis.spread_before), "spread_after": float(analysis.spread_after),
-            "warnings": list(analysis.warnings),
-        })
 
-    def _observations(self, frame: int, inside: Tensor) -> Observations:
-        value = torch.from_numpy(self.measured.velocity[frame].astype(np.float64)).flatten(1)[:, inside]
-        shape = (-1,) + (1,) * self.measured.dimension
-        variance = self.error.variance(self.measured, frame) * self.scale.reshape(shape)
-        spread = torch.from_numpy(variance).flatten(1)[:, inside]
-        value = torch.where(torch.isfinite(spread), value, torch.nan)
-        return Observations(
-            value.flatten(), spread.flatten(), position=self.nodes[inside],
-            redundancy=float(self.error.redundancy[frame])
-        )
+def _usual_speed(
+    measured: geometry.Recording, splines: FrameSmoother, smoothed: geometry.Recording | None
+) -> float:
+    """RMS per component of the splines, m/s; without them, of some of the frames'."""
+    if smoothed is None:
+        chosen = [f for f in range(0, measured.frames, 4) if splines.measures(f)]
+        parts = [splines.on_grid(splines.fit(f), f)[:, np.array(measured.mask[f], bool)] for f in chosen]
+        inside = np.concatenate(parts, 1) if parts else np.zeros(1)
+    else:
+        inside = np.moveaxis(smoothed.velocity, 1, -1)[np.asarray(measured.mask, bool)]
+    return float(np.sqrt(np.mean(np.square(inside, dtype=np.float64))))
 
-    def _learn_scale(self, analysis: Analysis, state: Tensor) -> None:
-        """Adapt the observation error to what the innovations show beyond the ensemble's own variance, slowly."""
-        parts = self.measured.dimension
-        used = (analysis.reason == 0).reshape(parts, -1)
-        squared = analysis.innovation.square().reshape(parts, -1)
-        own = state.double().var(0).reshape(parts, -1)
-        stated = analysis.innovation_variance.reshape(parts, -1) - own
-        for c in range(parts):
-            if bool(used[c].any()):
-                shown = float((squared[c][used[c]].mean() - own[c][used[c]].mean()) / stated[c][used[c]].mean())
-                self.scale[c] *= min(max(shown, 0.25), 4.0) ** (1.0 / self.options.memory)
 
-    def _spline_analysis(self, frame: int, inside: Tensor):
-        """The forecast mean plus the penalised spline of the innovation: an analysis in spline space."""
+def _identity(
+    measured: geometry.Recording, also: Sequence[geometry.Recording], model: Simulator, coarse: Simulator,
+    filter_: Filter, options: EnsembleOptions, members: int, seed: int,
+) -> list[object]:
+    """What must be the same for a run to go on where another stopped."""
+    simulators = [(one.scene.spacing, one.scheme, one.dtype, one.seeding) for one in (model, coarse)]
+    arrays = [array for recording in (measured, *also) for array in recording.arrays().values()]
+    return [simulators, filter_, options, members, seed, *arrays]
 
-        def analyse(mean: Tensor, observations: Observations) -> Tensor:
-            parts = self.measured.dimension
-            kept = (observations.codes() == 0).reshape(parts, -1).all(0).numpy()
-            innovation = np.zeros((parts, self.grid.size), np.float32)
-            innovation[:, inside] = np.nan_to_num(
-                (observations.value - mean.double()).reshape(parts, -1).numpy()
-            )
-            weight = np.zeros(self.grid.size, np.float32)
-            weight[inside.numpy()] = node_weights(self.measured, frame).reshape(-1)[inside.numpy()] * kept
-            if not (weight > 0).any():
-                return mean
-            shape = self.grid.shape
-            # innovations have a smoothness of their own, chosen from them as the cycle goes
-            anew = (frame - 1) % self.options.choose_every == 0
-            fitted = self.splines.fit_increment(
-                frame, innovation.reshape(parts, *shape), weight.reshape(shape), None if anew else self.increment_choice
-            )
-            self.increment_choice = fitted.choice
-            change = self.splines.on_grid(fitted, frame)
-            return mean + torch.from_numpy(change).reshape(parts, -1)[:, inside].flatten().to(mean.dtype)
 
-        return analyse
+def _as_recording(cycle: Cycle) -> geometry.Recording:
+    return cycle.measured.with_velocity(
+        np.stack([field.numpy() for field in cycle.fields]),
+        sigma=np.stack([sigma.numpy() for sigma in cycle.sigmas]),
+        uncovered=np.array(cycle.missing, np.int64), description=f"ensemble of {cycle.count} SPH simulations",
+    )
 
-    def _keep(self, field: np.ndarray, sigma: np.ndarray, missing: int) -> None:
-        self.fields.append(field)
-        self.sigmas.append(sigma)
-        self.missing.append(missing)
 
-    def result(self, members: int) -> EnsembleRun:
-        recording = self.measured.with_velocity(
-            np.stack(self.fields).astype(np.float32), sigma=np.stack(self.sigmas).astype(np.float32),
-            uncovered=np.array(self.missing, np.int64), description=f"ensemble of {members} SPH simulations",
-        )
-        info: dict[str, object] = {
-            "members": members, "replaced_members": self.replaced, "frames": self.frames_info,
-            "observation_error_scale": self.scale.tolist(), "options": repr(self.options),
-        }
-        return EnsembleRun(recording, info)
-
+def _accounts(cycle: Cycle) -> dict[str, Any]:
+    """What a metrics file says of the run."""
+    shape = (len(cycle.options.increments), cycle.grid.dimension)
+    weights = cycle.gain.weight.reshape(shape).tolist()
+    replaced = sum(1 for event in cycle.events if "failed" in event)
+    learned = {
+        name: {"mean": float(row.mean()), "deviation": float(row.std())}
+        for name, row in cycle.ensemble.parameters.items()
+    }
+    return {
+        "members": cycle.count, "replaced_members": replaced, "events": cycle.events,
+        "coasted_frames": sum(1 for event in cycle.events if "coasted" in event),
+        "gain": dict(zip(cycle.options.increments, weights, strict=True)), "spread_factor": cycle.spread.factor,
+        "observation_error_scale": cycle.scale.factor.tolist(), "kernel": [one.kernel for one in cycle.sources],
+        "estimated": learned, "filter": cycle.record.summary(), "options": repr(cycle.options),
+    }  # fmt: skip

@@ -24,7 +24,8 @@ from .terms import (
     tait_pressure,
 )
 from .transfer import solve_small
-from .walls import SMALLEST_SHARE, WallSample, completed, friction, potential_force, retardation, wall_pressure_force
+from .wall_pass import complete_forces, complete_rates
+from .walls import WallSample, potential_force, retardation
 from .xsph import neighbour_pull
 
 
@@ -36,6 +37,12 @@ class Surroundings(Protocol):
 
     def body_force(self, particles: Particles) -> Tensor | None:
         """Acceleration (N, D) by gravity and pressure sources, or None."""
+
+    def shortfall(self, particles: Particles) -> Tensor:
+        """By how much (N,), per time, the volume of a member's particles should grow to fill the cavity."""
+
+    def later(self, particles: Particles, step: Tensor) -> Particles:
+        """Go on in time by ``step`` (members,); the particles with what reservoirs prescribe then."""
 
 
 @dataclass(frozen=True)
@@ -228,7 +235,7 @@ class Stepper:
         divergence = rates.divergence
         if self.scheme.continuity == "mass":
             divergence = divergence / (1.0 + particles.deviation)  # 2.19 gives the density rate, rho0 = 1
-        return completed(divergence, rates.concentration, particles.velocity, wall)
+        return complete_rates(divergence, rates.concentration, particles.velocity, wall)
 
     def _new_density(
         self, particles: Particles, rates: Rates, divergence: Tensor, dt: Tensor, filtering: Tensor | None = None
@@ -282,12 +289,11 @@ class Stepper:
         acceleration = self.pair_search.backend.momentum(pairs, state, self.support, self.momentum_terms)
         body = around.body_force(particles)
         if wall is not None and wall.share is not None:
-            push = wall_pressure_force(self.scheme.pressure, pressure, particles.deviation, wall)
-            acceleration = acceleration + push
-            if self.scheme.wall.no_slip and self.coefficients.viscosity is not None:
-                nu = per_particle(self.coefficients.viscosity, particles.member)
-                acceleration = acceleration + friction(nu, particles.velocity, wall)
-            acceleration = acceleration / wall.share.clamp_min(SMALLEST_SHARE)[:, None]
+            acceleration = complete_forces(
+                acceleration, particles.velocity, wall, member=particles.member, form=self.scheme.pressure,
+                viscosity=self.coefficients.viscosity if self.scheme.wall.no_slip else None, pressure=pressure,
+                deviation=particles.deviation,
+            )
         elif wall is not None and isinstance(self.scheme.wall, PotentialWall):
             sound = per_particle(self.coefficients.sound_speed, particles.member)
             acceleration = acceleration + potential_force(self.scheme.wall, sound, wall)

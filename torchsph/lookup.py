@@ -6,6 +6,7 @@ import ctypes
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from geometry import Grid
 
@@ -26,10 +27,14 @@ class LookUp:
         unit: length of one unit of the points, m.
         plain: cells where the first channel exceeds this at every corner and moment need no interpolation: compiled
             code gives them the early values of their lowest corner, which costs a tenth. None: no such cells.
+        directed: whether channels 1 to D are a direction, given with length 1.
     """
 
-    def __init__(self, grid: Grid, early: Tensor, late: Tensor, unit: float, plain: float | None = None) -> None:
-        self.channels, self.steady = early.shape[0], early is late
+    def __init__(
+        self, grid: Grid, early: Tensor, late: Tensor, unit: float, plain: float | None = None, *,
+        directed: bool = False,
+    ) -> None:
+        self.channels, self.steady, self._directed = early.shape[0], early is late, directed
         self._rows = [rows_of(field) for field in ([early] if self.steady else [early, late])]
         self._plain = None if plain is None or early.is_cuda else _cells_above(torch.minimum(early[0], late[0]), plain)
         self._function = _compiled_function(self._rows[0])
@@ -48,7 +53,11 @@ class LookUp:
         alike = points.device.type == "cpu" and points.dtype == self._rows[0].dtype
         if self._function is not None and alike and not derived:
             return self._compiled(points, fraction)
-        return self._by_torch(points, fraction)
+        values = self._by_torch(points, fraction)
+        if not self._directed:
+            return values
+        last = 1 + points.shape[1]
+        return torch.cat([values[:, :1], functional.normalize(values[:, 1:last], dim=1), values[:, last:]], 1)
 
     def _compiled(self, points: Tensor, fraction: Tensor) -> Tensor:
         points, fraction = points.contiguous(), fraction.to(points.dtype).contiguous()
@@ -60,7 +69,7 @@ class LookUp:
             late=None if self.steady else self._rows[1].data_ptr(),
             plain=None if self._plain is None else self._plain.data_ptr(), points=points.data_ptr(),
             fraction=fraction.data_ptr(), origin=triple(*self._origin), step=triple(*self._step),
-            counts=(ctypes.c_int64 * 3)(*self._counts), out=out.data_ptr(),
+            counts=(ctypes.c_int64 * 3)(*self._counts), unit=self._directed, out=out.data_ptr(),
         )))
         return out
 

@@ -37,7 +37,7 @@ import torch
 
 import geometry
 
-__all__ = ["METRICS", "UNITS", "Score", "Scores", "evaluate", "matching_frames"]
+__all__ = ["METRICS", "UNITS", "Score", "Scores", "evaluate", "matching_frames", "spread_over_skill"]
 
 UNITS = {
     "nrmse": "1",
@@ -92,6 +92,24 @@ def evaluate(
     if measured is not None:
         scores["residual_rms"] = residual_rms(velocity, _on_frames_of(measured, recording, "the measurement"))
     return scores
+
+
+def spread_over_skill(recording: geometry.Recording, truth: geometry.Recording) -> Score | None:
+    """RMS of `sigma` over the RMS error of the velocity, over the truth's mask: 1 where the claim is right.
+
+    `None` for a recording without `sigma`.
+    """
+    if recording.sigma is None:
+        return None
+    reference = _on_frames_of(truth, recording, "the truth")
+    mask = np.asarray(reference.mask, bool)
+    error = _square_sums(filled_velocity(recording) - np.where(mask[:, None], reference.velocity, 0), mask)
+    claimed = _square_sums(np.nan_to_num(recording.sigma), mask)
+
+    def score(total: float, wrong: float) -> float | None:
+        return _root_mean(float(total), float(wrong))
+
+    return Score(score(claimed.sum(), error.sum()), [score(c, e) for c, e in zip(claimed, error, strict=True)])
 
 
 def filled_velocity(recording: geometry.Recording) -> np.ndarray:

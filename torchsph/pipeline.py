@@ -5,6 +5,7 @@ from __future__ import annotations
 import time as clock
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import geometry
@@ -12,20 +13,22 @@ import regularize
 
 from .ensemble import assimilate
 from .forecast import ForecastSkill, skill
+from .free_run import run_freely
 from .observation_error import estimate_error
+from .parallel import is_lead
 from .particle_filter import filter_sph
 from .presets import preset as scheme_preset
 from .scene import Scene
 from .simulator import Simulator
 from .smooth import FrameSmoother, smooth_frames
 
-METHODS = ("spline", "sph", "ensemble")
+METHODS = ("free", "spline", "sph", "ensemble")
 # written to analysis.h5 and run when no method is named
 DEFAULT_METHOD = "ensemble"
 DEFAULT_MEMBERS = 16
-# particle spacing of the analysing methods in grid spacings: a measurement blurred over several nodes does not hold
-# what finer particles could carry
+# particle spacing in grid spacings of the single runs and of the ensemble's members; its control run takes half of it
 ANALYSIS_SPACING = 2.0
+CONTROL_SHARE = 0.5
 
 
 @dataclass(frozen=True)
@@ -46,41 +49,67 @@ def make_model(
 
 def run_methods(
     measured: geometry.Recording, methods: Sequence[str], *, preset: str = "default", spacing: float | None = None,
-    members: int | None = None, seed: int = 0, device: str = "cpu", progress: bool = False,
+    members: int | None = None, also: Sequence[geometry.Recording] = (), truth: geometry.Recording | None = None,
+    checkpoints: str | Path | None = None, resume: bool = False, seed: int = 0, device: str = "cpu",
+    progress: bool = False,
 ) -> dict[str, MethodResult]:
     """Run methods by name on one measurement, in the order of ``METHODS``.
 
-    ``spacing`` (m) defaults to ``ANALYSIS_SPACING`` grid spacings, ``members`` to ``DEFAULT_MEMBERS``. The seconds of
-    "sph" and "ensemble" include the spline that they start from only where "spline" itself was not asked for.
+    "free", the run without data, comes along with every method that simulates. ``spacing`` (m) of the particles
+    defaults to ``ANALYSIS_SPACING`` grid spacings, half of it in the ensemble's control run; ``members`` to
+    ``DEFAULT_MEMBERS``. ``also``, ``truth``, ``checkpoints`` and ``resume`` are the ensemble's (``assimilate``); the
+    other methods know one measurement. The seconds of a method include the spline that it starts from only where
+    "spline" itself was not asked for.
 
-    Raises ValueError for an unknown method.
+    Under torchrun the processes beside the first take part in the ensemble alone, and return nothing else.
+
+    Raises ValueError for an unknown method, and for "sph" on a measurement along a beam.
     """
     unknown = [name for name in methods if name not in METHODS]
     if unknown:
         raise ValueError(f"unknown method {', '.join(unknown)}; known: {', '.join(METHODS)}")
+    if "sph" in methods and measured.beam is not None:
+        raise ValueError("method sph imposes full vectors and the measurement holds one component along a beam")
+    if not is_lead():
+        methods = [name for name in methods if name == "ensemble"]
+    if not methods:
+        return {}
     smoother = regularize.Smoother.preset(preset)
-    results: dict[str, MethodResult] = {}
-    began = clock.perf_counter()
+    timer = _Timer()
     splines = FrameSmoother(measured, smoother)
     smoothed = smooth_frames(splines, progress)
+    results: dict[str, MethodResult] = {}
     if "spline" in methods:
-        results["spline"] = MethodResult(smoothed, clock.perf_counter() - began, {"smoother": repr(smoother)})
-        began = clock.perf_counter()
-    if spacing is None:
-        spacing = ANALYSIS_SPACING * min(measured.grid.spacing)
+        results["spline"] = timer.result(smoothed, {"smoother": repr(smoother)})
+    spacing = ANALYSIS_SPACING * min(measured.grid.spacing) if spacing is None else spacing
     model = make_model(measured, preset=preset, spacing=spacing, device=device)
+    if is_lead() and set(methods) != {"spline"}:
+        free = run_freely(measured, model, smoothed.velocity[0], seed=seed, progress=progress)
+        results["free"] = timer.result(free, {})
     if "sph" in methods:
         error = estimate_error(measured, splines, smoothed)
         run = filter_sph(measured, model, error=error, seed=seed, progress=progress)
-        results["sph"] = MethodResult(run.recording, clock.perf_counter() - began, run.info)
-        began = clock.perf_counter()
+        results["sph"] = timer.result(run.recording, run.info)
     if "ensemble" in methods:
-        count = DEFAULT_MEMBERS if members is None else members
         many = assimilate(
-            measured, model, members=count, splines=splines, smoothed=smoothed, seed=seed, progress=progress
+            measured, make_model(measured, preset=preset, spacing=CONTROL_SHARE * spacing, device=device),
+            coarse=model, members=DEFAULT_MEMBERS if members is None else members, also=also, splines=splines,
+            smoothed=smoothed, truth=truth, checkpoints=checkpoints, resume=resume, seed=seed, progress=progress,
         )
-        results["ensemble"] = MethodResult(many.recording, clock.perf_counter() - began, many.info)
-    return results
+        results["ensemble"] = timer.result(many.recording, many.info)
+    return {name: results[name] for name in METHODS if name in results}
+
+
+class _Timer:
+    """Seconds between the results of one run after another."""
+
+    def __init__(self) -> None:
+        self.began = clock.perf_counter()
+
+    def result(self, recording: geometry.Recording, info: dict[str, Any]) -> MethodResult:
+        now = clock.perf_counter()
+        seconds, self.began = now - self.began, now
+        return MethodResult(recording, seconds, info)
 
 
 def forecast_skill(

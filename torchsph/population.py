@@ -70,6 +70,11 @@ class Population:
         self._record = record
         zero = torch.zeros(1, dtype=torch.float64)
         self._peak = float(support.kernel.value(zero, support.length, support.dimension))
+        self._lower = self._upper = torch.zeros(support.dimension, dtype=domain.dtype, device=domain.device)
+        if domain.walls is not None:  # a particle that has got away must not make the grid of cells endless
+            ends = torch.as_tensor(domain.scene.walls.vertices_at_keys, dtype=domain.dtype, device=domain.device)
+            ends = ends.reshape(-1, support.dimension) / domain.units.length
+            self._lower, self._upper = torch.floor(ends.amin(0)) - 1.0, ends.amax(0) + 1.0
 
     @classmethod
     def of(
@@ -141,8 +146,8 @@ class Population:
     ) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor, Tensor]]:
         """Places (n, D) in a frame without seams, their cells (n,), and the cells' origin, edges and numbers (D,)."""
         place = self.domain.wrapped(particles.position[row] + particles.position.new_tensor(shift))
-        origin, far = torch.floor(place.amin(0) / edge) * edge, place.amax(0)
-        size, period = torch.full_like(origin, edge), self.domain.period
+        origin, far, period = self._lower, self._upper, self.domain.period
+        size = torch.full_like(origin, edge)
         if period is not None:
             closed = torch.isfinite(period)
             whole = torch.where(closed, period, size)
@@ -150,7 +155,7 @@ class Population:
             origin, size = torch.where(closed, 0.0 * origin, origin), torch.where(closed, fitting, size)
             far = torch.where(closed, whole - 0.5 * size, far)
         counts = torch.floor((far - origin) / size).to(torch.int64) + 1
-        index = torch.minimum(((place - origin) / size).to(torch.int64), counts - 1)
+        index = torch.minimum(((place - origin) / size).to(torch.int64), counts - 1).clamp_min(0)
         cell = particles.member[row]
         for axis in range(particles.dimension):
             cell = cell * counts[axis] + index[:, axis]

@@ -22,9 +22,10 @@ if TYPE_CHECKING:
     from .integrate import Stepper
     from .projection import ProjectionStepper
 
-# depth (spacings) inside an opening at which velocity and pressure are read, support of the weight that reads them, and
-# how deep particles matter for it
-_DEPTH, _RADIUS = 1.0, 2.0
+# depth (spacings) inside an opening at which the pressure is read, and the velocity of fluid that enters (new particles
+# are noisy); that of fluid that leaves is read in the opening itself, where it may still gather speed. Support of the
+# weight that reads them, and how deep particles matter for it.
+_DEPTH, _ENTRY, _RADIUS = 1.0, 0.5, 2.0
 _REACH = _DEPTH + 1.5**2 * _RADIUS
 
 
@@ -87,17 +88,23 @@ class PressureValves:
 
         The velocity is the opening's own, and the fluid's along the normal.
         """
-        place, member = particles.position[row], particles.member[row]
-        mouth = place - (frame.height(place) + _DEPTH)[:, None] * frame.normal
+        mine, height = particles.select(row), frame.height(particles.position[row])
         near = particles.select(particles.inside & (frame.height(particles.position).abs() < _REACH))
-        fields = torch.stack([(near.velocity - frame.velocity) @ frame.normal, stepper.pressure(near)], 1)
-        found = fetch_at(
-            self._backend, mouth, member, near.position, near.member, fields, _RADIUS, period=self.domain.period
-        )
-        mine = particles.select(row)
-        old = torch.stack([(mine.velocity - frame.velocity) @ frame.normal, stepper.pressure(mine)], 1)
-        value = torch.where(found.covered[:, None], found.value, old)
-        return frame.velocity + value[:, :1] * frame.normal, value[:, 1]
+
+        def read(values: Tensor, old: Tensor, depth: Tensor) -> Tensor:
+            place = mine.position - (height + depth)[:, None] * frame.normal
+            found = fetch_at(
+                self._backend, place, mine.member, near.position, near.member, values[:, None], _RADIUS,
+                period=self.domain.period,
+            )
+            return torch.where(found.covered, found.value[:, 0], old)
+
+        deep = torch.full_like(height, _DEPTH)
+        old = (mine.velocity - frame.velocity) @ frame.normal
+        leaves = _mean(old, mine.member, mine.members).index_select(0, mine.member) > 0
+        along = read((near.velocity - frame.velocity) @ frame.normal, old, _ENTRY * (~leaves).to(deep.dtype))
+        pressure = read(stepper.pressure(near), stepper.pressure(mine), deep)
+        return frame.velocity + along[:, None] * frame.normal, pressure
 
 
 def _mean(values: Tensor, member: Tensor, members: int) -> Tensor:

@@ -12,13 +12,14 @@ from .incompressible import Projection
 from .integrate import Surroundings
 from .neighbours import PairSearch
 from .pairs.interface import MomentumTerms, Rates, RateTerms, Support, per_particle
+from .pairs.poisson import PoissonSolution
 from .parameters import Coefficients
 from .particles import Particles
-from .poisson import PoissonProblem, PoissonSolution, solve
 from .record import Record
 from .smoothing import kernel
 from .terms import shifting_displacement, softened_share
-from .walls import SMALLEST_SHARE, WallSample, completed, friction
+from .wall_pass import complete_forces, complete_rates
+from .walls import SMALLEST_SHARE, WallSample
 
 if TYPE_CHECKING:
     from .domain import Domain
@@ -32,6 +33,10 @@ _TINY = 1e-6
 _SHARES = 16
 # a displacement of more than this (spacings) would outrun the linearisation
 _LARGEST_MOVE = 0.2
+# part of a full kernel's moment below which no slope is drawn from what is left of it
+_SMALLEST_MOMENT = 0.3
+# cosine between the share's gradient and the wall's normal below which a wall is not plain
+_EDGE = 0.9
 
 
 @dataclass(frozen=True)
@@ -76,43 +81,70 @@ class Neighbourhood:
         excess = (filling / mean[group].clamp_min(_TINY) - 1.0).clamp(-_LARGEST_EXCESS, _LARGEST_EXCESS)
         return torch.where(counted, excess, torch.zeros_like(excess))
 
+    def wall_jump(self) -> Tensor:
+        """What the divergence at walls lacks, as a source (N,): half of the jump from the fluid's speed to the wall's.
+
+        Of a jump at the wall the kernels of the fluid see the half that lies on their side; a wall that accelerates
+        would so be followed by halves only. The fluid's normal velocity is continued linearly to the wall first, so
+        that a flow that keeps to the wall has no jump. Meant for walls that move: what it adds to those at rest is
+        noise at their edges.
+        """
+        p, wall = self.particles, self.wall
+        steep = wall.share_gradient.norm(dim=1)
+        terms = MomentumTerms(pressure="difference")
+        along = (p.velocity * wall.normal).sum(1)
+        fall = self.search.backend.momentum(self.pairs, p.state(along), self.support, terms)
+        # the sum's own moment across a plane wall, by the divergence theorem
+        moment = (wall.share - wall.distance * steep).clamp_min(_SMALLEST_MOMENT)
+        rise = -(fall * wall.normal).sum(1) / moment
+        jump = (wall.velocity * wall.normal).sum(1) - along + wall.distance.clamp_min(0.0) * rise
+        # where walls meet at an edge there is no such line to continue on
+        cosine = (wall.share_gradient * wall.normal).sum(1) / steep.clamp_min(_TINY)
+        plain = (cosine - _EDGE).clamp_min(0.0) / (1.0 - _EDGE)
+        return torch.where(p.fluid, plain * jump * steep / self.share, torch.zeros_like(jump))
+
+    def divergence(self, sums: Rates) -> tuple[Tensor, Tensor | None]:
+        """Velocity divergence (N,) for the pressure to answer, and the crowding gradient (N, D), complete at walls."""
+        p, wall = self.particles, self.wall
+        divergence, crowding = complete_rates(sums.divergence, sums.concentration, p.velocity, wall)
+        moves = wall is not None and bool(wall.velocity.any())
+        return (divergence - self.wall_jump() if moves else divergence), crowding
+
     def push(
         self, source: Tensor, start: Tensor | None, surface: Tensor | None, tolerance: float, iterations: int,
         held: Tensor | None = None,
     ) -> tuple[Tensor, PoissonSolution]:
         """Solve -laplacian(u) = ``source`` (N,); minus the gradient of u (N, D), 0 in reservoirs, and the solution.
 
-        The solution is continued into reservoirs. Walls and buffers are impermeable to u (Neumann); where ``surface``
-        (N,) bool u is 0, where ``held`` (N,) bool, in buffers, it is as in ``start``.
+        Walls and buffers are impermeable to u (Neumann); where ``surface`` (N,) bool u is 0, where ``held`` (N,) bool,
+        in buffers, it is as in ``start``.
         """
         p, backend = self.particles, self.search.backend
         state, fluid = p.state(p.deviation), p.fluid
         coupled = fluid if held is None else fluid | held
-        diagonal = backend.laplacian(self.pairs, state, self.support, torch.zeros_like(source), coupled)[1]
         free, singular = fluid, torch.ones(p.members, dtype=torch.bool, device=fluid.device)
         if surface is not None:
             free = fluid & ~surface
             singular = p.per_member(surface.to(torch.int64), "sum") == 0
-        if held is not None:
-            singular = singular & (p.per_member(held.to(torch.int64), "sum") == 0)
-        problem = PoissonProblem(
-            lambda u: backend.laplacian(self.pairs, state, self.support, u, coupled)[0], diagonal, p.mass, free,
-            singular, p.member, p.members,
-        )
         source = source * self.share
         if held is not None:
+            singular = singular & (p.per_member(held.to(torch.int64), "sum") == 0)
             kept = torch.where(held, start, torch.zeros_like(start))
-            source = source - problem.apply(kept)
-        found = solve(problem, source, start, tolerance=tolerance, iterations=iterations)
+            source = source - backend.laplacian(self.pairs, state, self.support, kept, coupled)[0]
+        found = backend.poisson(
+            self.pairs, state, self.support, source, start, free=free, active=coupled, singular=singular,
+            tolerance=tolerance, iterations=iterations,
+        )
         if held is not None:
             found = replace(found, values=found.values + kept)
         if self.wall is not None:
-            part = problem.total(torch.where(fluid, p.mass * self.share, torch.zeros_like(source)))
-            whole = problem.total(torch.where(fluid, p.mass, torch.zeros_like(source)))
-            found = replace(found, mismatch=found.mismatch * whole / part.clamp_min(_TINY))
-        terms = MomentumTerms(pressure="difference")
-        found = replace(found, values=self._continued(found.values, held))
-        slope = backend.momentum(self.pairs, p.state(found.values), self.support, terms)
+            volume = torch.where(fluid, p.mass, torch.zeros_like(p.mass)).double()
+            part = p.per_member(volume * self.share, "sum").clamp_min(_TINY)
+            found = replace(found, mismatch=found.mismatch * p.per_member(volume, "sum") / part)
+        # buffers take no part: the gradient by differences then continues the fluid's own pressure into them
+        mass = p.mass if bool(coupled.all()) else torch.where(coupled, p.mass, torch.zeros_like(p.mass))
+        state = p.changed(mass=mass).state(found.values)
+        slope = backend.momentum(self.pairs, state, self.support, MomentumTerms(pressure="difference"))
         slope = slope / self.share[:, None] if self.wall is not None else slope
         slope = torch.where(fluid[:, None], slope, torch.zeros_like(slope))
         return (slope if self.wall is not None else self._without_thrust(slope)), found
@@ -127,22 +159,6 @@ class Neighbourhood:
         thrust = push.new_zeros((p.members, push.shape[1])).index_add(0, p.member, p.mass[:, None] * push)
         return push - (thrust / mass[:, None]).index_select(0, p.member)
 
-    def _continued(self, values: Tensor, held: Tensor | None) -> Tensor:
-        """Values of the fluid and where ``held``, and in other buffers the mean of the fluid around: (N,)."""
-        fluid = self.particles.fluid if held is None else self.particles.fluid | held
-        if bool(fluid.all()):
-            return values
-        part = torch.where(fluid, self.particles.mass, torch.zeros_like(values))
-
-        def around(mass: Tensor) -> Tensor:
-            state = self.particles.changed(mass=mass).state(values)
-            terms = RateTerms(continuity=None, shepard=True)
-            return self.search.backend.rates(self.pairs, state, self.support, terms).shepard_mass
-
-        weight = around(part)
-        mean = around(part * values) / weight.clamp_min(torch.finfo(weight.dtype).tiny)
-        return torch.where(fluid, values, torch.where(weight > 0, mean, torch.zeros_like(mean)))
-
 
 def divergence_free(
     around: Neighbourhood, *, times: int = 1, tolerance: float = 1e-3, iterations: int = 200
@@ -155,7 +171,7 @@ def divergence_free(
     particles = around.particles
     for _ in range(times):
         now = Neighbourhood(particles, around.search, around.pairs, around.support, around.wall)
-        divergence, _ = completed(now.rates(RateTerms()).divergence, None, particles.velocity, around.wall)
+        divergence, _ = now.divergence(now.rates(RateTerms()))
         push, found = now.push(-divergence, None, None, tolerance, iterations)
         particles = particles.changed(velocity=particles.velocity + push)
     return particles.velocity, found
@@ -223,62 +239,104 @@ class ProjectionStepper:
     ) -> tuple[Particles, Tensor, WallSample | None]:
         """Advance every member by its own ``step`` (members,), internal time.
 
-        Friction and body forces first, then the projection, then the motion with the projected velocity. Returns the
-        particles, their acceleration (N, D) and the walls that they saw.
+        Half the way with the old velocity, there friction and body forces and the projection, then the other half with
+        the new velocity: positions are so of second order. Returns the particles, their acceleration (N, D) and the
+        walls that they saw, as they were at the start.
         """
         dt = per_particle(step, particles.member)
-        wall, before = around.sample(particles), particles.velocity
-        pairs = self.pair_search.at(particles)
-        force = self._without_pressure(particles, pairs, wall, around)
+        half = 0.5 * dt[:, None]
+        # a member that is not finite must not keep the others from their search; its velocity still gives it away
+        way = torch.nan_to_num(half * particles.velocity, nan=0.0, posinf=0.0, neginf=0.0)
+        middle = particles.changed(position=particles.position + way)
+        middle = around.later(middle, 0.5 * step)
+        wall, before = around.sample(middle), middle.velocity
+        here = Neighbourhood(middle, self.pair_search, self.pair_search.at(middle), self.support, wall)
+        weight = self._weight(middle, around)
+        sums, force = self._sums(here, around, weight)
         if force is not None:
-            moved = before + dt[:, None] * force
-            particles = particles.changed(velocity=torch.where(particles.fluid[:, None], moved, before))
-        here = Neighbourhood(particles, self.pair_search, pairs, self.support, wall)
-        sums = here.rates(self._terms)
-        divergence, crowding = completed(sums.divergence, sums.concentration, particles.velocity, wall)
+            pushed = torch.where(middle.fluid[:, None], middle.velocity + dt[:, None] * force, middle.velocity)
+            middle = middle.changed(velocity=pushed)
+        # the divergence of friction itself, small in a fluid of little viscosity, is met in the next step
+        divergence, crowding = replace(here, particles=middle).divergence(sums)
+        source, surface = self._source(here, sums, divergence)
+        held = None
+        if self.held_kinds is not None:
+            held = torch.isin(middle.kind, self.held_kinds)
+            source = source - self._drawn_in(middle, held, around)
+        push, found = here.push(
+            source, self._guess(middle, weight, dt), surface, self.scheme.tolerance, self.scheme.iterations, held
+        )
+        self._account(found, step)
+        velocity = middle.velocity + push
+        # what has not converged is no start for the next solve
+        per_step = torch.where(dt > 0, 1.0 / dt.clamp_min(torch.finfo(dt.dtype).tiny), torch.zeros_like(dt))
+        pressure = found.values * per_step * found.converged.index_select(0, particles.member)
+        pressure = pressure if weight is None else pressure + (weight * middle.position).sum(1)
+        drift = half * velocity
+        if crowding is not None:
+            drift = drift + self._shifted(middle.changed(velocity=velocity), crowding, step)
+        acceleration = (velocity - before) * per_step[:, None]
+        after = middle.changed(position=middle.position + drift, velocity=velocity, pressure=pressure)
+        return after, acceleration, None if wall is None else _earlier(wall, half, before)
+
+    def _source(self, here: Neighbourhood, sums: Rates, divergence: Tensor) -> tuple[Tensor, Tensor | None]:
+        """Source of the pressure (N,), and which particles lie at a free surface (N,) bool, or None."""
         surface, source = None, -divergence
         filling = here.filling(sums) if self._terms.shepard else None
         if self.scheme.surface is not None:
             surface = filling < self.scheme.surface
         if self.scheme.relaxation is not None:
-            counted = particles.inside if surface is None else particles.inside & ~surface
+            inside = here.particles.inside
+            counted = inside if surface is None else inside & ~surface
             source = source + here.excess(filling, counted) / self.scheme.relaxation
-        held = None if self.held_kinds is None else torch.isin(particles.kind, self.held_kinds)
-        push, found = here.push(
-            source, self._guess(particles, dt), surface, self.scheme.tolerance, self.scheme.iterations, held
-        )
-        self._account(found, step)
-        velocity = particles.velocity + push
-        # what has not converged is no start for the next solve
-        per_step = torch.where(dt > 0, 1.0 / dt.clamp_min(torch.finfo(dt.dtype).tiny), torch.zeros_like(dt))
-        pressure = found.values * per_step * found.converged.index_select(0, particles.member)
-        particles = particles.changed(velocity=velocity, pressure=pressure)
-        drift = dt[:, None] * velocity
-        if crowding is not None:
-            drift = drift + self._shifted(particles, crowding, step)
-        acceleration = (velocity - before) * per_step[:, None]
-        return particles.changed(position=particles.position + drift), acceleration, wall
-
-    def _without_pressure(
-        self, particles: Particles, pairs: Any, wall: WallSample | None, around: Surroundings
-    ) -> Tensor | None:
-        """Acceleration (N, D) by friction and body forces, or None without either."""
-        total = around.body_force(particles)
-        if self._laminar is None:
-            return total
-        state = particles.state(particles.deviation)
-        drag = self.pair_search.backend.momentum(pairs, state, self.support, self._laminar)
-        if wall is not None:
-            if self.scheme.wall.no_slip:
-                nu = per_particle(self.coefficients.viscosity, particles.member)
-                drag = drag + friction(nu, particles.velocity, wall)
-            drag = drag / wall.share.clamp_min(SMALLEST_SHARE)[:, None]
-        return drag if total is None else total + drag
+        return source, surface
 
     @staticmethod
-    def _guess(particles: Particles, dt: Tensor) -> Tensor | None:
+    def _drawn_in(particles: Particles, held: Tensor, around: Surroundings) -> Tensor:
+        """What the volume of the fluid inside should grow by, per time (N,), where a pressure is ``held`` (N,) bool.
+
+        Through other openings the flux sees to it; here the flow has to draw in what is missing.
+        """
+        drawn = particles.per_member(held.to(torch.int64), "sum") > 0
+        drawn = particles.inside & drawn.index_select(0, particles.member)
+        return torch.where(drawn, around.shortfall(particles), torch.zeros_like(particles.mass))
+
+    def _weight(self, particles: Particles, around: Surroundings) -> Tensor | None:
+        """The part (N, D) of a body force that only adds its potential to the pressure, or None.
+
+        Without a free surface or a given pressure a uniform force moves nothing along an axis that is not periodic. The
+        pressure that bears it would be large, and its differences on disordered particles stir the fluid; so it is left
+        out of the equation and added afterwards, exactly.
+        """
+        bound = self.scheme.surface is not None or self.held_kinds is not None
+        force = None if bound else around.body_force(particles)
+        if force is None or self.pair_search.period is None:
+            return force
+        return torch.where(torch.isinf(self.pair_search.period), force, torch.zeros_like(force))
+
+    def _sums(
+        self, here: Neighbourhood, around: Surroundings, weight: Tensor | None
+    ) -> tuple[Rates, Tensor | None]:
+        """First-pass sums, and the acceleration (N, D) by friction and body forces but ``weight``, or None."""
+        particles, wall, total = here.particles, here.wall, around.body_force(here.particles)
+        if weight is not None:
+            total = total - weight if self.pair_search.period is not None else None
+        if self._laminar is None:
+            return here.rates(self._terms), total
+        state = particles.state(particles.deviation)
+        sums, drag = here.search.backend.right_hand_side(here.pairs, state, self.support, self._terms, self._laminar)
+        if wall is not None:
+            nu = self.coefficients.viscosity if self.scheme.wall.no_slip else None
+            drag = complete_forces(drag, particles.velocity, wall, viscosity=nu, member=particles.member)
+        return sums, drag if total is None else total + drag
+
+    @staticmethod
+    def _guess(particles: Particles, weight: Tensor | None, dt: Tensor) -> Tensor | None:
         """The last step's pressure times this step; None before the first (half the iterations of a start from 0)."""
-        return None if particles.pressure is None else particles.pressure * dt
+        if particles.pressure is None:
+            return None
+        pressure = particles.pressure
+        return dt * (pressure if weight is None else pressure - (weight * particles.position).sum(1))
 
     def _shifted(self, particles: Particles, crowding: Tensor, step: Tensor) -> Tensor:
         shift = shifting_displacement(
@@ -294,3 +352,9 @@ class ProjectionStepper:
         record.unconverged += steps & ~found.converged
         mismatch = torch.where(steps, found.mismatch.abs(), torch.zeros_like(found.mismatch))
         record.largest_mismatch = torch.maximum(record.largest_mismatch, mismatch)
+
+
+def _earlier(wall: WallSample, half: Tensor, velocity: Tensor) -> WallSample:
+    """Walls seen half a step later, with the distance that there was before, to first order: ``half`` (N, 1), time."""
+    way = (half * (velocity - wall.velocity) * wall.normal).sum(1)
+    return replace(wall, distance=wall.distance - way)

@@ -23,6 +23,7 @@ class Record:
         inserted, removed: particles that entered and left, by valve: (members, valves).
         merged, reseeded: particles that population control merged into others, and that it put into holes.
         inflow, outflow: volume that entered and left, by valve, m^D (in a plane m^2): (members, valves).
+        cavity_change: of the cavity's volume since the run began, m^D: what has to enter less what leaves.
         energy_in, energy_out: kinetic energy and work of pressure that entered and left with it, by valve, J (in a
             plane J/m): (members, valves).
         wall_work: done on the fluid by moving walls: pressure, friction and stops; J (in a plane J/m).
@@ -59,6 +60,7 @@ class Record:
     reseeded: Tensor = field(init=False)
     inflow: Tensor = field(init=False)
     outflow: Tensor = field(init=False)
+    cavity_change: Tensor = field(init=False)
     energy_in: Tensor = field(init=False)
     energy_out: Tensor = field(init=False)
     wall_work: Tensor = field(init=False)
@@ -88,8 +90,8 @@ class Record:
             one[:, None].repeat(1, self.valves) * 0.0 for _ in range(4)
         )
         self.filling = one * float("nan")
-        self.largest_mach, self.largest_mismatch, self.wall_work, self.source_work = (
-            torch.zeros_like(one) for _ in range(4)
+        self.largest_mach, self.largest_mismatch, self.cavity_change, self.wall_work, self.source_work = (
+            torch.zeros_like(one) for _ in range(5)
         )
 
     def note_density(self, smallest: Tensor, largest: Tensor) -> None:
@@ -114,6 +116,7 @@ class Record:
             "largest_mach": self.largest_mach.tolist(), "outside": self.outside.tolist(),
             "crossed_wall": self.crossed_wall.tolist(), "inserted": self.inserted.tolist(),
             "removed": self.removed.tolist(), "inflow": self.inflow.tolist(), "outflow": self.outflow.tolist(),
+            "cavity_change": self.cavity_change.tolist(),
             "merged": self.merged.tolist(), "reseeded": self.reseeded.tolist(),
             "energy_in": self.energy_in.tolist(), "energy_out": self.energy_out.tolist(),
             "wall_work": self.wall_work.tolist(), "source_work": self.source_work.tolist(),

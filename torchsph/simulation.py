@@ -75,7 +75,7 @@ class Simulation:
         if self._pressures is not None:
             self._stepper.held_kinds = self._pressures.kinds
         self._acceleration = torch.zeros_like(particles.position)
-        self._imposed_at = self.time
+        self._began_at = self._imposed_at = self.time
         self._order: Tensor | None = None  # of the particles in space when they were last sorted
         self._sort_at = 0  # number of searches at which they are sorted again
 
@@ -109,7 +109,7 @@ class Simulation:
         self._unsort()
         self.record.searches = self._stepper.pair_search.searches
         self.record.overflows = self._backend.overflows
-        self.domain.account(self.particles, self.record, self.time)
+        self.domain.account(self.particles, self.record, self.time, self._began_at)
 
     def _longest_step(self, until: float) -> float:
         """Limit of the steps to time ``until`` (s) that the scheme names outright, internal."""
@@ -226,6 +226,7 @@ class Simulation:
         before, push = self.particles, self._acceleration
         inner = step.to(before.position.dtype)
         stepped, acceleration, wall = self._stepper.step(before, inner, self.record.steps, self.domain)
+        self.domain.at(self.time + (done + step) * self.units.time)
         after = self.domain.constrain(before, stepped, wall, inner, self.record)
         waiting = step == 0
         if bool(waiting.any()):

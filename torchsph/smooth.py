@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import torch
+from torch import Tensor
 from tqdm import tqdm
 
 import geometry
@@ -24,6 +25,12 @@ def node_weights(recording: geometry.Recording, frame: int) -> np.ndarray:
     return np.where(np.isfinite(recording.velocity[frame]).all(0), weight, 0.0)
 
 
+def beam_at(recording: geometry.Recording, frame: int) -> np.ndarray | None:
+    """Unit vectors (D, *shape) along which alone a frame was measured, or None for full vectors."""
+    beam = recording.beam
+    return None if beam is None else np.ascontiguousarray(beam if beam.ndim == recording.dimension + 1 else beam[frame])
+
+
 class FrameSmoother:
     """Spline fits of a recording's frames; neighbouring frames share what was chosen automatically.
 
@@ -36,19 +43,27 @@ class FrameSmoother:
     ) -> None:
         if choose_every < 1:
             raise ValueError(f"choose_every must be at least 1, got {choose_every}")
+        if recording.beam is not None and smoother.automatic:
+            smoother = smoother.fixed()  # there is no automatic choice from one component along a beam
         self.recording, self.smoother, self.choose_every = recording, smoother, choose_every
         self.motion = geometry.WallMotion.from_recording(recording)
         self.nodes = recording.grid.nodes()
         self._choices: dict[int, regularize.Choice | None] = {}
 
     def choice(self, frame: int) -> regularize.Choice | None:
-        """What was chosen for the middle frame of the frame's group; None for a smoother with fixed options."""
+        """What was chosen for the middle frame of the frame's group, or the nearest to it that measured anything.
+
+        None for a smoother with fixed options, and where the whole group has no data.
+        """
         if not self.smoother.automatic:
             return None
         group = frame // self.choose_every
         if group not in self._choices:
-            middle = min(group * self.choose_every + self.choose_every // 2, self.recording.frames - 1)
-            self._choices[group] = self._fit(middle).choice
+            first = group * self.choose_every
+            members = range(first, min(first + self.choose_every, self.recording.frames))
+            from_middle = sorted(members, key=lambda k: abs(k - first - self.choose_every // 2))
+            middle = next((k for k in from_middle if self.measures(k)), None)
+            self._choices[group] = None if middle is None else self._fit(middle).choice
         return self._choices[group]
 
     def fit(self, frame: int, *, uncertainty: bool = False) -> regularize.SplineField:
@@ -59,33 +74,66 @@ class FrameSmoother:
         return self._fit(frame, uncertainty=uncertainty, choice=self.choice(frame))
 
     def fit_increment(
-        self, frame: int, innovation: np.ndarray, weight: np.ndarray, choice: regularize.Choice | None
+        self, frame: int, points: Tensor, samples: Tensor, weight: Tensor, *, beam: Tensor | None = None,
+        choice: regularize.Choice | None = None,
     ) -> regularize.SplineField:
-        """The spline of an innovation (D, *shape) with confidences (*shape), whose walls are at rest.
+        """The spline of an increment from samples (n, D) at points (n, D) with confidences (n,); walls are at rest.
 
-        ``choice``: taken over from an earlier innovation; None chooses from this one.
+        ``beam`` (n, D): directions along which alone the samples know it; noise and smoothness are then those of
+        ``choice``, or the smoother's own. ``choice``: taken over from an earlier increment; None chooses from this one.
         """
-        return self._fit(frame, innovation, weight, at_rest=True, choice=choice)
+        smoother = self.smoother
+        if beam is not None:
+            known = {} if choice is None else {"curvature": choice.curvature, "no_slip": choice.no_slip}
+            smoother, choice = smoother.fixed(**known), None
+        mask = torch.from_numpy(np.array(self.recording.mask[frame], bool).reshape(-1))
+        return smoother.fit(
+            points.double(), samples.double(), weight.double(),
+            wall_rows(self.recording, self.motion, frame, at_rest=True), divergence_points=self.nodes[mask],
+            beam=beam, choice=choice,
+        )
 
     def _fit(
-        self, frame: int, velocity: np.ndarray | None = None, weight: np.ndarray | None = None, *,
-        at_rest: bool = False, uncertainty: bool = False, choice: regularize.Choice | None = None,
+        self, frame: int, *, uncertainty: bool = False, choice: regularize.Choice | None = None
     ) -> regularize.SplineField:
         recording, dimension = self.recording, self.recording.dimension
-        field = recording.velocity[frame] if velocity is None else velocity
-        weight = node_weights(recording, frame) if weight is None else weight
         mask = torch.from_numpy(np.array(recording.mask[frame], bool).reshape(-1))
-        flat_weight = torch.from_numpy(np.asarray(weight, np.float64).reshape(-1))
-        used = (flat_weight > 0) & mask
+        weight = torch.from_numpy(node_weights(recording, frame).astype(np.float64).reshape(-1))
+        used = (weight > 0) & mask
         if not bool(used.any()):
             time = float(recording.time[frame])
             raise ValueError(f"frame {frame} (t = {time:g} s) has no node with a positive weight inside the mask")
-        samples = torch.from_numpy(np.nan_to_num(field.reshape(dimension, -1), copy=True)).double().T
+        field = recording.velocity[frame].reshape(dimension, -1)
+        samples = torch.from_numpy(np.nan_to_num(field, copy=True)).double().T
         return self.smoother.fit(
-            self.nodes[used], samples[used], flat_weight[used],
-            wall_rows(recording, self.motion, frame, at_rest=at_rest), divergence_points=self.nodes[mask],
-            uncertainty=uncertainty, choice=choice,
+            self.nodes[used], samples[used], weight[used], wall_rows(recording, self.motion, frame),
+            divergence_points=self.nodes[mask], beam=self._beam(frame, used), uncertainty=uncertainty, choice=choice,
         )
+
+    def measures(self, frame: int) -> bool:
+        """Whether a frame has anything to fit."""
+        return bool((node_weights(self.recording, frame) > 0).any())
+
+    def draws(
+        self, fitted: regularize.SplineField, frame: int, count: int, generator: torch.Generator
+    ) -> Tensor:
+        """(count, D, *shape) deviations from a fit of ``uncertainty=True``, drawn from its posterior; 0 outside."""
+        recording = self.recording
+        mask = torch.from_numpy(np.array(recording.mask[frame], bool).reshape(-1))
+        out = torch.zeros((count, recording.dimension, recording.grid.size), dtype=torch.float64)
+        for one in out:
+            drawn = torch.zeros((fitted.knots.nodes, recording.dimension), dtype=torch.float64)
+            drawn[fitted.factor.ordering.nodes] = fitted.factor.sample(fitted.posterior.precision, generator)
+            coefficients = drawn.T.reshape(-1, *fitted.knots.shape)
+            one[:, mask] = regularize.SplineField(fitted.knots, coefficients, fitted.covered)(
+                self.nodes[mask], outside=0.0
+            ).T
+        return out.reshape(count, recording.dimension, *recording.grid.shape)
+
+    def _beam(self, frame: int, used: Tensor) -> Tensor | None:
+        """(n, D) directions of the used nodes, or None for full vectors."""
+        beam = beam_at(self.recording, frame)
+        return None if beam is None else torch.from_numpy(beam.reshape(self.recording.dimension, -1)).double().T[used]
 
     def on_grid(self, fitted: regularize.SplineField, frame: int) -> np.ndarray:
         """The field at the nodes (D, *shape) float32, 0 outside the mask."""
@@ -113,10 +161,16 @@ def smooth(
 
 
 def smooth_frames(frames: FrameSmoother, progress: bool = False) -> geometry.Recording:
-    """``smooth`` with a ``FrameSmoother`` of the caller's, who can then ask it what was chosen."""
+    """``smooth`` with a ``FrameSmoother`` of the caller's, who can then ask it what was chosen.
+
+    A frame in which nothing was measured has no spline: it holds 0 and counts as uncovered.
+    """
     recording = frames.recording
-    bar = tqdm(range(recording.frames), desc="spline", disable=None if progress else True, unit="frame")
-    fields = np.stack([frames.on_grid(frames.fit(frame), frame) for frame in bar])
-    return recording.with_velocity(
-        fields, uncovered=np.zeros(recording.frames, np.int64), description="penalised B-spline, frame by frame"
-    )
+    fields = np.zeros(recording.velocity.shape, np.float32)
+    missing = np.zeros(recording.frames, np.int64)
+    for frame in tqdm(range(recording.frames), desc="spline", disable=None if progress else True, unit="frame"):
+        if frames.measures(frame):
+            fields[frame] = frames.on_grid(frames.fit(frame), frame)
+        else:
+            missing[frame] = np.count_nonzero(recording.mask[frame])
+    return recording.with_velocity(fields, uncovered=missing, description="penalised B-spline, frame by frame")

@@ -7,7 +7,6 @@ from collections import OrderedDict
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn import functional
 
 from geometry import Grid, OrificePlane, Surface, WallMotion, grid_winding, orifices
 
@@ -117,18 +116,17 @@ class WallFields:
 
     def between(self, first: Tensor, second: Tensor) -> LookUp:
         """The fields of two key frames made ready for look-ups between them."""
-        return LookUp(self.grid, first, second, self.spacing, plain=self.reach + _FAR)
+        return LookUp(self.grid, first, second, self.spacing, plain=self.reach + _FAR, directed=True)
 
     def sample(self, fields: LookUp, fraction: Tensor, position: Tensor) -> WallSample:
         """Walls at positions (N, D), internal; ``fraction`` (N,) or () of the way from the first key frame."""
         values = fields.at(position, fraction)
         d = self.dimension
-        normal = functional.normalize(values[:, 1 : 1 + d], dim=1)
-        sample = (values[:, 0], normal, values[:, 1 + d : 1 + 2 * d])
+        sample = (values[:, 0], values[:, 1 : 1 + d], values[:, 1 + d : 1 + 2 * d])
         if not self.complete:
             return WallSample(*sample)
         swept = values[:, 2 + 3 * d] if self.sliding else None
-        return WallSample(*sample, values[:, 1 + 2 * d], values[:, 2 + 2 * d : 2 + 3 * d], swept)
+        return WallSample(*sample, values[:, 1 + 2 * d], values[:, 2 + 2 * d : 2 + 3 * d], swept, values)
 
 
 def _open_channel(

@@ -11,11 +11,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from .pairs.interface import square_length
 from .schemes import PotentialWall
 
 # the velocity gradient at the wall is taken over at least this distance (spacings): closer particles would be braked
 # faster than the viscous time step resolves. Many stand within 0.3 of the wall: 0.3 here lets a pipe flow slip by 0.5 %
-_SMALLEST_FRICTION_DISTANCE = 0.15
+SMALLEST_FRICTION_DISTANCE = 0.15
 
 # a particle whose kernel lies almost wholly behind walls would divide by nothing
 SMALLEST_SHARE = 0.1
@@ -31,6 +32,7 @@ class WallSample:
         share_gradient: (N, D) its gradient, which points into the fluid; None likewise.
         swept: (N,) integral of the kernel times the wall's normal velocity (inwards) over its surface, or None: the
             nearest point's velocity stands for all of the wall.
+        rows: (N, C) all of it side by side, for compiled code (``wall_pass``), or None.
     """
 
     distance: Tensor
@@ -39,6 +41,7 @@ class WallSample:
     share: Tensor | None = None
     share_gradient: Tensor | None = None
     swept: Tensor | None = None
+    rows: Tensor | None = None
 
 
 def _depth(model: PotentialWall, wall: WallSample) -> Tensor:
@@ -94,8 +97,12 @@ def completed(
     return divergence, None if crowding is None else crowding - wall.share_gradient
 
 
+def friction_rate(viscosity: float | Tensor, wall: WallSample) -> Tensor:
+    """2 nu |grad share| / d (N,): by which laminar friction takes on a no-slip wall's velocity (see ``friction``)."""
+    gap = wall.distance.clamp_min(SMALLEST_FRICTION_DISTANCE)
+    return 2.0 * viscosity * square_length(wall.share_gradient).sqrt() / gap
+
+
 def friction(viscosity: float | Tensor, velocity: Tensor, wall: WallSample) -> Tensor:
     """Laminar friction with a no-slip wall: 2 nu |grad share| (v_wall - v) / d (Ferrand et al. 2013 eq. 30)."""
-    gap = wall.distance.clamp_min(_SMALLEST_FRICTION_DISTANCE)
-    rate = 2.0 * viscosity * wall.share_gradient.norm(dim=1) / gap
-    return rate[:, None] * (wall.velocity - velocity)
+    return friction_rate(viscosity, wall)[:, None] * (wall.velocity - velocity)

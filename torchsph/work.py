@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from .pairs.interface import per_particle, square_length
+from .pairs.interface import inner, per_particle, square_length
 from .particles import Particles
 from .record import Record
 from .schemes import CompleteKernelWall, PotentialWall
 from .units import Units
-from .walls import WallSample, friction, potential_force, retardation
+from .walls import WallSample, friction_rate, potential_force, retardation
 
 if TYPE_CHECKING:
     from .domain import Domain
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 def energy_unit(units: Units, density: float, dimension: int) -> float:
-    """J (in a plane J/m) of a particle of one internal mass with twice the reference speed squared / 2."""
+    """J (in a plane J/m) per internal energy, which counts masses in those of a spacing^D of fluid at rest density."""
     return density * units.length**dimension * units.speed**2
 
 
@@ -41,7 +41,7 @@ class WorkAccount:
     Pressure does the work  int p v_wall . n dA,  as a sum over the particles whose kernels the wall cuts: the kernel's
     integral over the wall is the gradient of its share inside (Ferrand et al. 2013), and half of a kernel centred on a
     plane wall lies inside. Where the wall is curved or folded that half is off by the curvature over a kernel's radius.
-    A potential wall does the work of its force and of its retardation, which is exact. What walls do to particles that
+    A potential wall does the work of the force and the retardation that particles feel. What walls do to particles that
     they stop outright is added where that happens (``Domain.constrain``).
     """
 
@@ -94,10 +94,10 @@ class WorkAccount:
                 dt = per_particle(step, stepped.member)
                 change = stepped.velocity - retardation(self._wall, sound, -dt, stepped.velocity, wall)
                 force = force + change / dt.clamp_min(torch.finfo(dt.dtype).tiny)[:, None]
-            return (force * wall.velocity).sum(1)
-        swept = (wall.velocity * wall.share_gradient).sum(1) if wall.swept is None else wall.swept
+            return inner(force, wall.velocity)
+        swept = inner(wall.velocity, wall.share_gradient) if wall.swept is None else wall.swept
         power = 2.0 * stepper.pressure(stepped) / (1.0 + stepped.deviation) * swept
         if self._friction and c.viscosity is not None:
-            drag = friction(per_particle(c.viscosity, stepped.member), before.velocity, wall)
-            power = power + (drag * wall.velocity).sum(1)
+            rate = friction_rate(per_particle(c.viscosity, stepped.member), wall)
+            power = power + rate * (square_length(wall.velocity) - inner(before.velocity, wall.velocity))
         return power

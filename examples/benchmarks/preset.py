@@ -75,6 +75,7 @@ from torchsph import (
     XSPH,
     CompleteKernelWall,
     NumericalFailure,
+    PopulationControl,
     PotentialWall,
     PressureSource,
     Reservoir,
@@ -128,6 +129,7 @@ RIVALS: dict[str, dict[str, dict[str, object]]] = {
         "run-out of 3": {"valve": Reservoir(run_out=3.0)}, "pressure source": {"valve": PressureSource()},
         "shut": {"valve": None},
     },
+    "population": {"controlled": {"population": PopulationControl()}},
 }  # fmt: skip
 # what a flow without walls does not have
 WALLS_ONLY = ("wall", "valve", "transfer", "seeding")

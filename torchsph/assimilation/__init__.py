@@ -38,6 +38,7 @@ from .figure import filter_figure
 from .filters import Analysis, EnsembleFilter, Filter, GlobalTransform, Transform, check_ensemble
 from .hybrid import HybridGain
 from .inflation import RTPP, RTPS, Adaptive, Inflation, Multiplicative
+from .learned_gain import LearnedGain
 from .letkf import LETKF, LocalTransform
 from .localisation import Localisation, gaspari_cohn
 from .observations import Observations, Reason, Screened, concatenate, count_reasons, screen
@@ -46,6 +47,7 @@ from .reduced_unscented import ReducedUnscented
 from .rotation import random_rotation
 from .sigma import SigmaPoints, Simplex, Symmetric, draw_ensemble, draw_points
 from .smoother import FixedLagSmoother
+from .spread_match import SpreadMatch
 from .subspace import ErrorSubspace, update_weights, zero_sum_basis
 from .unscented import UnscentedFilter, UnscentedUpdate
 
@@ -69,6 +71,7 @@ __all__ = [
     "HybridGain",
     "Inflation",
     "InnovationStatistics",
+    "LearnedGain",
     "LocalTransform",
     "Localisation",
     "Multiplicative",
@@ -81,6 +84,7 @@ __all__ = [
     "Screened",
     "SigmaPoints",
     "Simplex",
+    "SpreadMatch",
     "StochasticEnKF",
     "Symmetric",
     "Transform",

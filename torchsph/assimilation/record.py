@@ -69,6 +69,18 @@ class FilterRecord:
             self._warnings[words] = self._warnings.get(words, 0) + 1
         self.cycles.append(cycle)
 
+    def state(self) -> dict:
+        """What a checkpoint has to hold."""
+        return {
+            "cycles": list(self.cycles), "histogram": self._histogram, "warnings": dict(self._warnings),
+            "innovations": {name: list(parts) for name, parts in self._innovations.items()},
+        }  # fmt: skip
+
+    def restore(self, state: dict) -> None:
+        self.cycles, self._histogram = list(state["cycles"]), state["histogram"]
+        self._warnings = dict(state["warnings"])
+        self._innovations = {name: list(parts) for name, parts in state["innovations"].items()}
+
     def statistics(self) -> dict[str, InnovationStatistics]:
         """Normalised innovations of all cycles together, per region."""
         return {

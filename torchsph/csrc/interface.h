@@ -43,6 +43,19 @@ typedef struct {
       *laplacian, *diagonal, *gradient, *moment_first, *moment_second, *moment_mass;
 } sph_pass;
 
+typedef struct { /* the pressure Poisson equation; see poisson.hpp */
+  sph_pass pass;              /* terms: the Laplacian; its sums are not written */
+  const void *source, *start; /* (particles,); start null: from 0 */
+  const uint8_t *free, *singular; /* (particles,) unknowns, (members,) where the constant is in the null space */
+  const int64_t* member;      /* (particles,) */
+  int64_t members, iterations;
+  double tolerance;
+  void* values;               /* (particles,) */
+  int64_t* count;             /* (members,) iterations, and so on */
+  double *residual, *mismatch;
+  uint8_t* converged;
+} sph_poisson;
+
 typedef struct { /* moments of a first-order moving-least-squares fetch; see interpolation.hpp */
   sph_search particles;
   const void* fields;         /* (particles, columns) */
@@ -76,8 +89,32 @@ typedef struct { /* fields on a regular grid, looked up at points; see look_up.c
   const void *points, *fraction;      /* (count, dimension), (fractions,) of the way from early to late */
   double origin[3], step[3];
   int64_t counts[3];                  /* nodes along x, y, z, at least 2 each */
+  int32_t unit;                       /* whether channels 1 to dimension are a direction, to be of length 1 */
   void* out;                          /* (count, channels) */
 } sph_look_up;
+
+typedef struct { /* complete-kernel walls' part of the sums; see walls.cpp */
+  int32_t dimension, threads, form;   /* form: sph::PressureForm */
+  int64_t count, channels;
+  const void* rows;                   /* (count, channels): distance, normal, wall velocity, share, gradient, swept */
+  const void* velocity;               /* (count, dimension) */
+  const void *divergence, *crowding;  /* rates: (count,), (count, dimension) or null */
+  void *whole_divergence, *whole_crowding;
+  const void *pressure, *deviation;   /* forces: (count,) each, or null without pressure */
+  const double* viscosity;            /* (viscosities,): 0 without friction, 1 for all, or one per member */
+  int64_t viscosities;
+  const int64_t* member;              /* (count,) */
+  const void* acceleration;           /* (count, dimension) */
+  void* whole_acceleration;
+  double smallest_share, smallest_gap;
+  const void *before, *after, *distance; /* near: (count, dimension) each; distance where the walls were seen, */
+  int64_t distance_stride;               /* which may be a column */
+  const double* step;                    /* (members,) */
+  const uint8_t* held;                   /* (count,) whether walls hold a particle */
+  double gap;
+  int64_t* near;                         /* (count,) indices, of which as many are filled as are returned */
+  void* near_distance;                   /* (count,) likewise */
+} sph_walls;
 
 #ifdef __cplusplus
 extern "C" {
@@ -89,10 +126,18 @@ int64_t sph_list_f32(const sph_search*, int64_t capacity, sph_lists*); /* entrie
 int64_t sph_list_f64(const sph_search*, int64_t capacity, sph_lists*);
 int sph_pass_f32(const sph_pass*);
 int sph_pass_f64(const sph_pass*);
+int sph_poisson_f32(const sph_poisson*);
+int sph_poisson_f64(const sph_poisson*);
 int64_t sph_interpolate_f32(const sph_interpolation*); /* number of unusable particles and queries; 0: done */
 int64_t sph_interpolate_f64(const sph_interpolation*);
 void sph_look_up_f32(const sph_look_up*);
 void sph_look_up_f64(const sph_look_up*);
+void sph_wall_rates_f32(const sph_walls*);
+void sph_wall_rates_f64(const sph_walls*);
+void sph_wall_forces_f32(const sph_walls*);
+void sph_wall_forces_f64(const sph_walls*);
+int64_t sph_wall_near_f32(const sph_walls*);
+int64_t sph_wall_near_f64(const sph_walls*);
 void sph_grid_closest(const sph_closest*);
 int sph_runs(const char* instruction_set);             /* whether this processor has it */
 double sph_fma(int threads, int64_t turns, float factor); /* float32 multiply-adds; the flop done */

@@ -74,6 +74,15 @@ void gather(const Place<Real, D>& place, const int64_t* offset, int64_t channels
     gather<Real, D, 1>(place, offset, channels, early + i, late ? late + i : nullptr, after, out + i);
 }
 
+// Channels 1 to D made a direction, as torch.nn.functional.normalize does.
+template <class Real, int D>
+void direct(Real* out) {
+  Real square = 0;
+  for (int d = 1; d <= D; ++d) square += out[d] * out[d];
+  const Real length = std::max(std::sqrt(square), Real(1e-12));
+  for (int d = 1; d <= D; ++d) out[d] /= length;
+}
+
 template <class Real, int D>
 void look_up(const sph_look_up& a) {
   constexpr int64_t corners = 1 << D, block = 16;
@@ -117,11 +126,13 @@ void look_up(const sph_look_up& a) {
       }
       if (a.plain && a.plain[place.node]) {
         std::copy(early + place.node * channels, early + (place.node + 1) * channels, sum);
+        if (a.unit) direct<Real, D>(sum);
         continue;
       }
       const Real after = late ? fractions[a.fractions == 1 ? 0 : n] : Real(0);
       const int64_t room = (nodes - place.node - offset[corners - 1]) * channels;
       gather<Real, D>(place, offset, channels, room, early, late, after, sum);
+      if (a.unit) direct<Real, D>(sum);
     }
   }
 }

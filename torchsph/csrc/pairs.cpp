@@ -6,6 +6,7 @@
 #include "interpolation.hpp"
 #include "lists.hpp"
 #include "passes.hpp"
+#include "poisson.hpp"
 
 #ifndef SPH_REAL
 #error "compile with -DSPH_REAL=float -DSPH_SUFFIX=_f32 or -DSPH_REAL=double -DSPH_SUFFIX=_f64"
@@ -22,6 +23,7 @@ using Real = SPH_REAL;
 // Kept between calls of a thread, so that a step allocates nothing.
 thread_local Columns<Real> columns, queries;
 thread_local Rows<Real> rows;
+thread_local PoissonRoom<Real> room;
 
 Shape shape_of(const sph_search& s) {
   return {s.particles, s.member, s.radius, {s.period[0], s.period[1], s.period[2]}, s.threads};
@@ -29,11 +31,14 @@ Shape shape_of(const sph_search& s) {
 
 // The combinations that are compiled: every subset of the rates, every subset of the accelerations, and (float on wide
 // registers) the two together, where a scheme evaluates them at one state. Elsewhere the caller makes two passes.
+// The incompressible scheme asks for the filling of the kernels as well, with and without friction.
+constexpr std::uint32_t filling = continuity | shepard, filling_shifted = filling | concentration;
+
 constexpr bool compiled(std::uint32_t t) {
   const std::uint32_t rates = t & (continuity | diffusion | concentration | xsph);
   const std::uint32_t forces = t & (pressure | artificial | laminar | tensile);
   if (t > 255) return t == shepard || t == renormalisation || t == laplacian || t == gradient || t == (gradient | renormalisation) ||
-           t == corrected_diffusion || t == moments;
+           t == corrected_diffusion || t == moments || t == filling || t == filling_shifted || t == (filling_shifted | laminar);
   if ((t & tensile) && !(t & pressure)) return false;
   if (!rates || !forces) return t != 0;
   return sizeof(Real) == 4 && register_bytes > 16 && (t & continuity) && (t & pressure) && !(t & (concentration | tensile));
@@ -57,26 +62,46 @@ template <int D, std::size_t... T> Run find(std::uint32_t terms, std::index_sequ
     case gradient | renormalisation: return run_of<D, gradient | renormalisation>();
     case corrected_diffusion: return run_of<D, corrected_diffusion>();
     case moments: return run_of<D, moments>();
+    case filling: return run_of<D, filling>();
+    case filling_shifted: return run_of<D, filling_shifted>();
+    case filling_shifted | laminar: return run_of<D, filling_shifted | laminar>();
     default: return nullptr;
   }
+}
+
+const Real* reals(const void* a) { return static_cast<const Real*>(a); }
+
+Lists<Real> lists_of(const sph_pass& p) {
+  return {p.particles, p.clusters, p.slot, p.owner, p.entries, p.offset, reals(p.home),
+          {p.period[0], p.period[1], p.period[2]}, p.home != nullptr, p.threads};
+}
+
+State<Real> state_of(const sph_pass& p) {
+  return {reals(p.position), reals(p.velocity), reals(p.mass), reals(p.deviation), reals(p.pressure),
+          reals(p.slope), reals(p.field), p.active, p.weight, p.form};
 }
 
 template <int D> int pass(const sph_pass& p) {
   const Run run = find<D>(p.terms, std::make_index_sequence<256>());
   if (!run) return SPH_NOT_COMPILED;
-  const auto reals = [](const void* a) { return static_cast<const Real*>(a); };
   const auto out = [](void* a) { return static_cast<Real*>(a); };
-  const Lists<Real> lists{p.particles, p.clusters, p.slot, p.owner, p.entries, p.offset, reals(p.home),
-                          {p.period[0], p.period[1], p.period[2]}, p.home != nullptr, p.threads};
-  const State<Real> state{reals(p.position), reals(p.velocity), reals(p.mass), reals(p.deviation), reals(p.pressure),
-                          reals(p.slope), reals(p.field), p.active, p.weight, p.form};
+  const Lists<Real> lists = lists_of(p);
   const Outputs<Real> outputs{out(p.divergence), out(p.diffusion), out(p.concentration), out(p.xsph), out(p.acceleration),
                               out(p.shepard_volume), out(p.shepard_mass), out(p.renormalisation), out(p.laplacian),
                               out(p.diagonal), out(p.gradient), out(p.moment_first), out(p.moment_second),
                               out(p.moment_mass)};
   const KernelChoice kernel{p.kernel, p.support, p.sigma};
-  pack<Real, D>(layout(D, p.terms), state, lists, rows);
+  pack<Real, D>(layout(D, p.terms), state_of(p), lists, rows);
   run(lists, rows, kernel, reinterpret_cast<const Coefficients*>(p.coefficients), outputs);
+  return SPH_DONE;
+}
+
+template <int D> int poisson(const sph_poisson& p) {
+  const Lists<Real> lists = lists_of(p.pass);
+  State<Real> state = state_of(p.pass);
+  state.field = reals(p.source);  // any: the solver puts in its own
+  pack<Real, D>(layout(D, laplacian), state, lists, rows);
+  Poisson<Real, D>(p, lists, rows, room).run();
   return SPH_DONE;
 }
 
@@ -126,6 +151,8 @@ int64_t SPH_NAME(sph_list)(const sph_search* s, int64_t capacity, sph_lists* out
 int64_t SPH_NAME(sph_interpolate)(const sph_interpolation* p) {
   return p->particles.dimension == 3 ? interpolate<3>(*p) : interpolate<2>(*p);
 }
+
+int SPH_NAME(sph_poisson)(const sph_poisson* p) { return p->pass.dimension == 3 ? poisson<3>(*p) : poisson<2>(*p); }
 
 int SPH_NAME(sph_pass)(const sph_pass* p) { return p->dimension == 3 ? pass<3>(*p) : pass<2>(*p); }
 

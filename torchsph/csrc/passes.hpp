@@ -148,7 +148,7 @@ template <class Real, int D, std::uint32_t T> struct Pass {
     }
     if constexpr (has(laplacian)) {
       put<Real>(s.laplacian, 2 * per_slope, factor, slot, o.laplacian, 1);
-      put<Real>(s.diagonal, 2 * per_slope, factor, slot, o.diagonal, 1);
+      if (o.diagonal) put<Real>(s.diagonal, 2 * per_slope, factor, slot, o.diagonal, 1);
     }
     for (int d = 0; d < D; ++d) {
       if constexpr (has(gradient)) put<Real>(s.gradient[d], per_slope, nullptr, slot, o.gradient + d, D);

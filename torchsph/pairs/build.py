@@ -65,6 +65,7 @@ _OBJECTS = (
     _Object("closest.cpp", "closest", ()),
     _Object("look_up.cpp", "look_up", ()),
     _Object("machine.cpp", "machine", ()),
+    _Object("walls.cpp", "walls", ()),
 )
 
 

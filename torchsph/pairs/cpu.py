@@ -14,6 +14,7 @@ from . import plan
 from .interface import Moments, PairState, Support, check_search
 from .native import library
 from .planned import PlannedBackend, lengths
+from .poisson import PoissonSolution
 
 # buffers of lists that nobody holds any more; a few, so that memory is given back
 _SPARE: deque[Tensor] = deque(maxlen=4)
@@ -127,6 +128,21 @@ class CpuBackend(PlannedBackend):
             None if field is None else field.contiguous(),
             None if active is None else active.contiguous(),
         )
+
+    def poisson(
+        self, pairs: ClusterPairs, state: PairState, support: Support, source: Tensor, start: Tensor | None, *,
+        free: Tensor, active: Tensor, singular: Tensor, tolerance: float, iterations: int,
+    ) -> PoissonSolution:
+        self.check(state.position, source, *(() if start is None else (start,)))
+        self._check_state(pairs, state)
+        kind, numbers = plan.kernel_choice(support, self.name)
+        values, count, residual, converged, mismatch = operators.poisson(
+            pairs.lists, pairs.period, kind, numbers, plan.coefficients(support, None, singular.shape[0]),
+            *(t.contiguous() for t in (state.position, state.mass, state.deviation, state.member, source)),
+            None if start is None else start.contiguous(),
+            *(t.contiguous() for t in (free, active, singular)), tolerance, iterations,
+        )
+        return PoissonSolution(values, count, residual, converged, mismatch)
 
     def interpolate(
         self,

@@ -14,7 +14,15 @@ import torch
 from torch import Tensor
 
 from . import plan
-from .native import InterpolationArguments, ListArguments, PassArguments, SearchArguments, Sizes, library
+from .native import (
+    InterpolationArguments,
+    ListArguments,
+    PassArguments,
+    PoissonArguments,
+    SearchArguments,
+    Sizes,
+    library,
+)
 
 CLUSTER = 8
 _REALS = {torch.float32: "f32", torch.float64: "f64"}
@@ -148,41 +156,64 @@ def pair_pass(
     Returns:
         One tensor per name in ``plan.Pass(terms, weight).outputs``.
     """
-    slot, owner, entries, offset, home = lists
-    terms, weight, form, kind = choice
+    terms, weight = choice[:2]
     outputs = plan.allocate(terms, position)
-    given = PassArguments(
-        position.shape[1],
-        torch.get_num_threads(),
-        terms,
-        weight,
-        form,
-        kind,
-        kernel[0],
-        kernel[1],
-        position.shape[0],
-        owner.shape[0],
-        slot.data_ptr(),
-        owner.data_ptr(),
-        entries.data_ptr(),
-        offset.data_ptr(),
-        home.data_ptr() if home.numel() else None,
-        _period(period),
-        coefficients.data_ptr(),
-        position.data_ptr(),
-        velocity.data_ptr(),
-        mass.data_ptr(),
-        deviation.data_ptr(),
-        _address(pressure),
-        _address(slope),
-        _address(field),
-        _address(active),
+    given = _pass_arguments(
+        lists, period, choice, kernel, coefficients, position, velocity, mass, deviation, pressure, slope, field, active
     )
     for name, output in zip(plan.Pass(terms, weight).outputs, outputs, strict=True):
         setattr(given, name, output.data_ptr())
     if library().function("pass", _REALS[position.dtype])(ctypes.byref(given)):
         raise NotImplementedError(f"no compiled pass has exactly the terms {terms:#x}")
     return outputs
+
+
+def _pass_arguments(
+    lists: Sequence[Tensor], period: Sequence[float], choice: Sequence[int], kernel: Sequence[float],
+    coefficients: Tensor, position: Tensor, velocity: Tensor | None, mass: Tensor, deviation: Tensor,
+    pressure: Tensor | None = None, slope: Tensor | None = None, field: Tensor | None = None,
+    active: Tensor | None = None,
+) -> PassArguments:
+    slot, owner, entries, offset, home = lists
+    terms, weight, form, kind = choice
+    return PassArguments(
+        dimension=position.shape[1], threads=torch.get_num_threads(), terms=terms, weight=weight, form=form,
+        kernel=kind, support=kernel[0], sigma=kernel[1], particles=position.shape[0], clusters=owner.shape[0],
+        slot=slot.data_ptr(), owner=owner.data_ptr(), entries=entries.data_ptr(), offset=offset.data_ptr(),
+        home=home.data_ptr() if home.numel() else None, period=_period(period), coefficients=coefficients.data_ptr(),
+        position=position.data_ptr(), velocity=_address(velocity), mass=mass.data_ptr(), deviation=deviation.data_ptr(),
+        pressure=_address(pressure), slope=_address(slope), field=_address(field), active=_address(active),
+    )
+
+
+def poisson(
+    lists: Sequence[Tensor], period: Sequence[float], kind: int, kernel: Sequence[float], coefficients: Tensor,
+    position: Tensor, mass: Tensor, deviation: Tensor, member: Tensor, source: Tensor, start: Tensor | None,
+    free: Tensor, active: Tensor | None, singular: Tensor, tolerance: float, iterations: int,
+) -> list[Tensor]:
+    """Conjugate gradients for the Laplacian of the cluster lists; arguments as in ``Backend.poisson``.
+
+    Not an operator of torch: how long it runs depends on the numbers.
+
+    Returns:
+        values (N,); iterations int64, residual float64, converged bool and mismatch float64, (members,) each.
+    """
+    members = singular.shape[0]
+    choice = [plan.LAPLACIAN, plan.BY_VOLUME, 0, kind]
+    given = _pass_arguments(
+        lists, period, choice, kernel, coefficients, position, None, mass, deviation, active=active
+    )
+    values, converged = torch.empty_like(source), torch.empty(members, dtype=torch.bool)
+    count = torch.empty(members, dtype=torch.int64)
+    residual, mismatch = (torch.empty(members, dtype=torch.float64) for _ in range(2))
+    arguments = PoissonArguments(
+        pass_=given, source=source.data_ptr(), start=_address(start), free=free.data_ptr(),
+        singular=singular.data_ptr(), member=member.data_ptr(), members=members, iterations=iterations,
+        tolerance=tolerance, values=values.data_ptr(), count=count.data_ptr(), residual=residual.data_ptr(),
+        mismatch=mismatch.data_ptr(), converged=converged.data_ptr(),
+    )
+    library().function("poisson", _REALS[position.dtype])(ctypes.byref(arguments))
+    return [values, count, residual, converged, mismatch]
 
 
 def _interpolation_moments_shapes(

@@ -88,6 +88,27 @@ class PassArguments(ctypes.Structure):
     ]
 
 
+class PoissonArguments(ctypes.Structure):
+    """sph_poisson of csrc/interface.h."""
+
+    _fields_ = [
+        ("pass_", PassArguments),
+        ("source", _pointer),
+        ("start", _pointer),
+        ("free", _pointer),
+        ("singular", _pointer),
+        ("member", _pointer),
+        ("members", _long),
+        ("iterations", _long),
+        ("tolerance", _real),
+        ("values", _pointer),
+        ("count", _pointer),
+        ("residual", _pointer),
+        ("mismatch", _pointer),
+        ("converged", _pointer),
+    ]
+
+
 class InterpolationArguments(ctypes.Structure):
     """sph_interpolation of csrc/interface.h."""
 
@@ -148,7 +169,44 @@ class LookUpArguments(ctypes.Structure):
         ("origin", _real * 3),
         ("step", _real * 3),
         ("counts", _long * 3),
+        ("unit", _int),
         ("out", _pointer),
+    ]
+
+
+class WallArguments(ctypes.Structure):
+    """sph_walls of csrc/interface.h."""
+
+    _fields_ = [
+        ("dimension", _int),
+        ("threads", _int),
+        ("form", _int),
+        ("count", _long),
+        ("channels", _long),
+        ("rows", _pointer),
+        ("velocity", _pointer),
+        ("divergence", _pointer),
+        ("crowding", _pointer),
+        ("whole_divergence", _pointer),
+        ("whole_crowding", _pointer),
+        ("pressure", _pointer),
+        ("deviation", _pointer),
+        ("viscosity", _pointer),
+        ("viscosities", _long),
+        ("member", _pointer),
+        ("acceleration", _pointer),
+        ("whole_acceleration", _pointer),
+        ("smallest_share", _real),
+        ("smallest_gap", _real),
+        ("before", _pointer),
+        ("after", _pointer),
+        ("distance", _pointer),
+        ("distance_stride", _long),
+        ("step", _pointer),
+        ("held", _pointer),
+        ("gap", _real),
+        ("near", _pointer),
+        ("near_distance", _pointer),
     ]
 
 
@@ -223,8 +281,12 @@ def _declare(handle: ctypes.CDLL) -> ctypes.CDLL:
         listing.argtypes = [ctypes.POINTER(SearchArguments), _long, ctypes.POINTER(ListArguments)]
         listing.restype = _long
         getattr(handle, f"sph_pass_{reals}").argtypes = [ctypes.POINTER(PassArguments)]
+        getattr(handle, f"sph_poisson_{reals}").argtypes = [ctypes.POINTER(PoissonArguments)]
         look_up = getattr(handle, f"sph_look_up_{reals}")
         look_up.argtypes, look_up.restype = [ctypes.POINTER(LookUpArguments)], None
+        for name, result in (("wall_rates", None), ("wall_forces", None), ("wall_near", _long)):
+            part = getattr(handle, f"sph_{name}_{reals}")
+            part.argtypes, part.restype = [ctypes.POINTER(WallArguments)], result
         interpolate = getattr(handle, f"sph_interpolate_{reals}")
         interpolate.argtypes, interpolate.restype = [ctypes.POINTER(InterpolationArguments)], _long
     handle.sph_grid_closest.argtypes, handle.sph_grid_closest.restype = [ctypes.POINTER(ClosestArguments)], None

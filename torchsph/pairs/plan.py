@@ -6,7 +6,7 @@ w = m / rho with the pressure sum divided by rho_a afterwards, or by mass, w = m
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -42,6 +42,10 @@ _OUTPUTS: tuple[tuple[int, str, int], ...] = (
     (MOMENTS, "moment_second", _MATRIX),
     (MOMENTS, "moment_mass", _VECTOR),
 )
+
+# what an incompressible step asks for at once; loops over these rates take Shepard's sums along
+_WITH_SHEPARD = (CONTINUITY, CONTINUITY | CONCENTRATION)
+_FILLING = CONTINUITY | CONCENTRATION | SHEPARD
 
 
 @dataclass(frozen=True)
@@ -82,6 +86,8 @@ def rate_passes(terms: RateTerms) -> list[Pass]:
             passes.append(Pass(CONTINUITY, BY_MASS))
         else:
             passes, flags = [Pass(CONTINUITY | flags, BY_MASS)], 0
+    if terms.shepard and flags in _WITH_SHEPARD:
+        flags, terms = flags | SHEPARD, replace(terms, shepard=False)
     return passes + ([Pass(flags, BY_VOLUME)] if flags else []) + _separate_passes(terms)
 
 
@@ -100,6 +106,8 @@ def force_pass(terms: MomentumTerms) -> Pass | None:
 def shared_passes(rates: RateTerms, momentum: MomentumTerms) -> list[Pass] | None:
     """Passes that sum rates and forces in one loop; None for a combination that is not compiled so."""
     force = force_pass(momentum)
+    if force is not None and force.terms == LAMINAR and [p.terms for p in rate_passes(rates)] == [_FILLING]:
+        return [Pass(_FILLING | LAMINAR, BY_VOLUME, momentum)]
     if force is None or not force.terms & PRESSURE or force.terms & TENSILE or rates.concentration:
         return None
     if rates.continuity != ("volume" if force.weight == BY_VOLUME else "mass"):

@@ -63,19 +63,23 @@ class Calibration:
 
 
 def features(estimates: Estimates, beam: Tensor, axial: bool) -> Tensor:
-    """What the log variance is linear in, (n, 6): 1, predicted log variance, log(1 - rho), log peak ratio,
-    SNR and share of power passed by the clutter filter (both in 10 dB).
+    """What the log variance is linear in, (n, 8): 1, predicted log variance, log(1 - rho), log peak ratio, log shear,
+    and in 10 dB the SNR, the share of power passed by the clutter filter and its response to the velocity.
 
-    All bounded, so that an odd estimate cannot ask for an absurd deviation. An unknown SNR counts as 20 dB.
+    All bounded, so that an odd estimate cannot ask for an absurd deviation. What a tracker does not tell (NaN) counts
+    as the least that is known: a variance of 1 m^2/s^2, a peak ratio of 1, an SNR of 20 dB.
     """
     along = beam.square()
     share = along if axial else (1 - along) / max(beam.shape[1] - 1, 1)
-    predicted = (estimates.variance * share).sum(1).clamp(1e-10, 1.0).log()
+    predicted = torch.nan_to_num((estimates.variance * share).sum(1), nan=1.0).clamp(1e-10, 1.0).log()
     decorrelation = (1 - estimates.correlation).clamp(1e-4, 1.0).log()
-    ratio = estimates.peak_ratio.clamp(1.0, 10.0).log()
+    ratio = torch.nan_to_num(estimates.peak_ratio, nan=1.0).clamp(1.0, 10.0).log()
     snr = torch.nan_to_num(estimates.snr, nan=20.0).clamp(-10, 40) / 10
     power = torch.nan_to_num(estimates.power, nan=0.0).clamp(-60, 5) / 10
-    return torch.stack([torch.ones_like(predicted), predicted, decorrelation, ratio, snr, power], 1)
+    response = torch.nan_to_num(estimates.response, nan=0.0).clamp(-20, 0) / 10
+    shear = torch.nan_to_num(estimates.shear, nan=10.0).clamp(10.0, 300.0).log()
+    one = torch.ones_like(predicted)
+    return torch.stack([one, predicted, decorrelation, ratio, shear, snr, power, response], 1)
 
 
 def fit_calibration(estimates: Estimates, error: Tensor, beam: Tensor) -> Calibration:

@@ -27,6 +27,10 @@ class ClutterFilter(Protocol):
         """Power that white noise keeps, mean over the images that come out."""
         ...
 
+    def response(self, frequency: np.ndarray) -> np.ndarray:
+        """Power response at ``frequency`` in units of the PRF."""
+        ...
+
 
 @dataclass(frozen=True)
 class FIRFilter:
@@ -127,3 +131,7 @@ class SVDFilter:
 
     def noise_gain(self, images: int) -> float:
         return 1 - self.rank / images
+
+    def response(self, frequency: np.ndarray) -> np.ndarray:
+        """Ones: what is removed depends on the data."""
+        return np.ones(np.shape(frequency))

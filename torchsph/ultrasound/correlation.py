@@ -143,8 +143,8 @@ def _lag_products(kernel: Tensor, region: Tensor, shape: KernelShape, images: in
     result = kernel.new_empty(points, lz, ly, lx)
     for x in range(lx):
         window = lines[..., x * images : (x + kx) * images].transpose(1, 2)
-        product = kernel.new_zeros(points, ky, lz * ry)
-        for z in range(kz):
+        product = torch.bmm(kernel[:, 0], window[..., : lz * ry])
+        for z in range(1, kz):
             product.baddbmm_(kernel[:, z], window[..., z * ry : (z + lz) * ry])
         # lag y of kernel row k is region row k + y: a diagonal of the product
         diagonals = product.as_strided(

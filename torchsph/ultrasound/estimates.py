@@ -19,6 +19,9 @@ class Flag(IntFlag):
     FLAT = 8  # the correlation has no peak (constant image, no scatterers)
     NOT_FINITE = 16  # NaN or infinity in the kernel
     DECORRELATED = 32  # correlation below the threshold
+    BRIGHT = 64  # more power than blood has: tissue that passed the clutter filter
+    AMBIGUOUS = 128  # the peak does not tell which whole turn of the phase is the right one
+    STOPPED = 256  # a velocity that the clutter filter does not let pass: residue, or a whole turn off one
 
 
 def bit(condition: Tensor, flag: Flag) -> Tensor:
@@ -34,8 +37,10 @@ class Estimates:
     search over the second. curvature (n, D): -(second derivative of log |rho|) per axis, 1/m^2. variance
     (n, D): (m/s)^2 up to a constant, what correlation and curvature say of the precision; calibration makes a
     ``sigma`` of it. power (n,): share of the unfiltered power that passed the clutter filter, dB. snr
-    (n,): power over thermal noise after the filter, dB (NaN if the noise is unknown). lag (n,): images
-    between those compared. flags (n,): :class:`Flag` bits, 0 = accepted.
+    (n,): power over thermal noise after the filter, dB (NaN if the noise is unknown). response (n,): of the
+    clutter filter at the Doppler frequency of the velocity, dB. shear (n,): size of the axial velocity's
+    gradient, 1/s (NaN if it was not looked for). lag (n,): images between those compared. flags (n,):
+    :class:`Flag` bits, 0 = accepted.
     """
 
     velocity: Tensor
@@ -45,6 +50,8 @@ class Estimates:
     variance: Tensor
     power: Tensor
     snr: Tensor
+    response: Tensor
+    shear: Tensor
     lag: Tensor
     flags: Tensor
 

@@ -18,7 +18,8 @@ class Motion:
     """Motion of P kernels, all in array order z, y, x.
 
     shift (P, 3): m per image. correlation (P,): |rho| at the peak. peak_ratio (P,), curvature (P, 3), variance
-    (P, 3) in m^2 per image squared, lag (P,): see :class:`Estimates`. sound (P,): whether there is a peak.
+    (P, 3) in m^2 per image squared, lag (P,): see :class:`Estimates`. sound (P,): whether there is a peak. gap
+    (P,): by how many turns of the phase the peak of the wide search is off along the beam, 0 to 0.5.
     """
 
     shift: Tensor
@@ -28,6 +29,7 @@ class Motion:
     variance: Tensor
     lag: Tensor
     sound: Tensor
+    gap: Tensor
 
     def better(self, other: Motion, allowed: Tensor) -> Motion:
         """Takes ``other`` where allowed (P,), sound and promising a smaller total variance."""
@@ -36,8 +38,9 @@ class Motion:
         for name in (field.name for field in fields(self)):
             mine, theirs = getattr(self, name), getattr(other, name)
             picked[name] = torch.where(take.view(-1, *[1] * (mine.dim() - 1)), theirs, mine)
-        # the ratio of peaks is that of the wide search: refinements see one peak alone
-        return Motion(**picked | {"peak_ratio": self.peak_ratio, "sound": self.sound | take})
+        # the ratio of peaks and the gap are those of the wide search: refinements see one peak alone
+        kept = {"peak_ratio": self.peak_ratio, "gap": self.gap, "sound": self.sound | take}
+        return Motion(**picked | kept)
 
 
 def find_motion(
@@ -54,10 +57,11 @@ def find_motion(
     peak = find_peak(rho.squeeze(1) if 0 not in active else rho)
     spacing, along = images.spacing[active], beam[:, active]
     start = offset[:, active] * spacing
-    shift = start + peak.lag * spacing
+    shift, gap = start + peak.lag * spacing, torch.zeros_like(peak.ratio)
     if phase:
         guess = shift if prior is None else prior.shift[:, active] * lag
         axial = _axial_shift(peak, (guess * along).sum(1), images.packet.acquisition.phase_per_metre)
+        gap = (axial - (guess * along).sum(1)).abs() * images.packet.acquisition.phase_per_metre / (2 * math.pi)
         # a lag in nodes is lag * spacing metres, hence the direction
         shift = start + peak.constrained(along * spacing, axial - (start * along).sum(1)) * spacing
     wave = images.packet.acquisition.phase_per_metre if phase else None
@@ -72,7 +76,7 @@ def find_motion(
     magnitude = peak.value.abs()
     return Motion(
         whole(shift / lag), magnitude, peak.ratio, whole(curvature), whole(variance / (lag**2 * count)),
-        torch.full_like(offset[:, 0], lag), peak.concave & (magnitude > 0),
+        torch.full_like(offset[:, 0], lag), peak.concave & (magnitude > 0), gap,
     )  # fmt: skip
 
 

@@ -53,6 +53,14 @@ class Prepared:
         z, y, x = (corner + corner.new_tensor(self.shape.half)).unbind(1)
         return self.turn_gradient[z, y, x]
 
+    def shear(self, corner: Tensor) -> Tensor:
+        """Size (P,), 1/s, of the gradient of the axial velocity in kernels; NaN where it was not asked for."""
+        ramp = self.ramp(corner)
+        if ramp is None:
+            return self.power.new_full((len(corner),), math.nan)
+        acquisition = self.packet.acquisition
+        return (ramp / self.spacing).norm(dim=1) / (acquisition.phase_per_metre * acquisition.interval)
+
     def holds(self, nodes: Tensor) -> Tensor:
         """Whether kernels around ``nodes`` (P, 3), and one node beyond, lie inside the image: (P,) bool."""
         last = nodes.new_tensor([1] * (3 - self.packet.grid.dimension) + list(self.packet.grid.shape)) - 1
@@ -83,9 +91,12 @@ def prepare(
     """
     if len(packet.iq) < 2:
         raise ValueError(f"speckle tracking compares images; the packet has {len(packet.iq)}")
-    finite = torch.isfinite(_mean_power(packet.iq))
-    clean = packet.iq if bool(finite.all()) else torch.where(finite, packet.iq, 0)
+    clean, before = packet.iq, _mean_power(packet.iq)
+    finite = torch.isfinite(before)
+    if not bool(finite.all()):
+        clean, before = torch.where(finite, clean, 0), torch.where(finite, before, 0)
     filtered = clean if clutter is None else clutter.apply(clean)
+    after = before if clutter is None else _mean_power(filtered)
     if len(filtered) < least_images:
         raise ValueError(
             f"{len(filtered)} of {len(packet.iq)} images are left after the clutter filter, too few for a "
@@ -102,11 +113,14 @@ def prepare(
         edges = [side for m in reversed(margin) for side in (m, m)]
         return F.pad(field.reshape(*[1] * len(lead), *field.shape), edges)
 
-    volume = torch.stack([padded(image) for image in filtered], -1)
+    whole = [n + 2 * m for n, m in zip([1] * len(lead) + list(packet.grid.shape), margin, strict=True)]
+    volume = filtered.new_zeros((*whole, len(filtered)))
+    middle = tuple(slice(m, n - m) for n, m in zip(whole, margin, strict=True))
+    volume[middle] = filtered.reshape(len(filtered), *[1] * len(lead), *packet.grid.shape).movedim(0, -1)
     gain = 1.0 if clutter is None else clutter.noise_gain(len(packet.iq))
     return Prepared(
-        packet, shape, volume, padded(_mean_power(clean)), padded(_mean_power(filtered)),
-        padded(finite.to(volume.real.dtype)), padded(torch.ones_like(clean[0].real)), margin,
+        packet, shape, volume, padded(before), padded(after),
+        padded(finite.to(before)), padded(torch.ones_like(before)), margin,
         torch.tensor([1.0] * len(lead) + spacing, dtype=volume.real.dtype, device=volume.device),
         None if packet.noise is None else packet.noise * gain,
         turn_gradient(volume, shape.half) if follow_shear else None, tuple(range(len(lead), 3)),

@@ -13,6 +13,7 @@ from .noise import frame_seed
 from .tracking import SpeckleTracker
 from .training import TrainingPlan, calibrate
 
+BRIGHTEST = 10.0  # dB over the mean of blood: brighter kernels are taken for tissue
 TRAINING = 0x7EA1  # makes the seed of the calibration's simulations differ from every frame's
 
 
@@ -31,7 +32,11 @@ class SpeckleOptions(ScannerOptions):
         self.plan()
 
     def tracker(self) -> SpeckleTracker:
-        return SpeckleTracker(kernel=self.kernel, search=self.search, clutter=self.filter())
+        # a scanner's operator knows about how bright blood is; speckle alone hardly takes a kernel 10 dB above that
+        max_snr = self.snr + BRIGHTEST
+        return SpeckleTracker(
+            kernel=self.kernel, search=self.search, clutter=self.filter(), max_snr=max_snr
+        )
 
     def plan(self) -> TrainingPlan:
         return TrainingPlan(simulations=self.training)

@@ -14,13 +14,16 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from .acquisition import Packet
+from .acquisition import Acquisition, Packet, decibel
 from .clutter import ClutterFilter, FIRFilter
 from .correlation import ImagePairs, KernelShape
 from .estimates import Estimates, Flag, bit
 from .gates import gates
 from .motion import Motion, find_motion
 from .prepared import Prepared, prepare
+
+TOLERATED_GAP = 0.25  # turns between the peak's axial shift and the phase's: halfway to the next whole turn
+LEAST_CORRELATION = 0.5  # below it peaks of noise are as high, however weak the echoes are said to be
 
 
 @dataclass(frozen=True)
@@ -36,11 +39,14 @@ class SpeckleTracker:
         images (from the mean phase of successive images), so that shear does not make their products cancel.
     clutter: filter over the packet, ``None`` = already filtered.
     min_snr: least power over that of thermal noise after the filter, dB, where the packet states its noise;
-        ``None`` = no gate. min_blood: least share of the unfiltered power that passes the filter, dB, or
-        ``None``.
+        ``None`` = no gate. max_snr: greatest, dB: tissue is some 40 dB brighter than blood, and what of it
+        passes the filter correlates better than any blood; ``None`` = no gate.
+    min_blood: least share of the unfiltered power that passes the filter, dB, or ``None``.
+    min_response: least response of the clutter filter at the estimate's own Doppler frequency, dB, or ``None``.
     min_correlation: least correlation; lone_correlation: the same where no longer lag confirms the first,
-        whose axial phase may then be a whole turn off. tile: points correlated at a time, which bounds
-        memory.
+        whose axial phase may then be a whole turn off. Both are of the echoes without their noise: where that
+        is known, echoes that make up a share s of the power need s times as much, but at least 0.5.
+    tile: points correlated at a time, which bounds memory.
     """
 
     kernel: float = 1e-3
@@ -50,10 +56,12 @@ class SpeckleTracker:
     phase: bool = True
     follow_shear: bool = True
     clutter: ClutterFilter | None = field(default_factory=FIRFilter)
-    min_snr: float | None = 6.0
+    min_snr: float | None = 9.0
+    max_snr: float | None = None
     min_blood: float | None = -60.0
-    min_correlation: float = 0.7
-    lone_correlation: float = 0.8
+    min_response: float | None = -12.0
+    min_correlation: float = 0.8
+    lone_correlation: float = 0.9
     tile: int = 32
 
     def __post_init__(self) -> None:
@@ -95,13 +103,15 @@ def _track_tile(
     snr, share, flags = gates(
         images, corner,
         min_samples=options.min_samples, min_blood=options.min_blood, min_snr=options.min_snr,
+        max_snr=options.max_snr,
     )  # fmt: skip
     axes = list(reversed(images.active))
-    interval = images.packet.acquisition.interval
+    packet, interval = images.packet, images.packet.acquisition.interval
     kept = torch.nonzero(flags == 0)[:, 0]
     motion = _follow(images, pairs, nodes[kept], beam[kept], options)
     velocity = motion.shift[:, axes] / interval
-    flags[kept] = _doubts(velocity, motion, options)
+    response = _response((motion.shift * beam[kept]).sum(1), packet.acquisition, options.clutter)
+    flags[kept] = _doubts(velocity, motion, snr[kept], response, options)
 
     def spread(values: Tensor, otherwise: float) -> Tensor:
         return values.new_full((len(nodes), *values.shape[1:]), otherwise).index_copy(0, kept, values)
@@ -111,7 +121,8 @@ def _track_tile(
         peak_ratio=spread(motion.peak_ratio, 1.0), curvature=spread(motion.curvature[:, axes], 0.0),
         # of what was not correlated nothing is known but that it is within the range
         variance=spread(motion.variance[:, axes] / interval**2, options.search**2),
-        power=share, snr=snr, lag=spread(motion.lag, pairs[0].apart), flags=flags,
+        power=share, snr=snr, response=spread(response, 0.0), shear=images.shear(corner),
+        lag=spread(motion.lag, pairs[0].apart), flags=flags,
     )  # fmt: skip
 
 
@@ -135,13 +146,28 @@ def _follow(
     return motion
 
 
-def _doubts(velocity: Tensor, motion: Motion, options: SpeckleTracker) -> Tensor:
-    """Flags (P,) of correlated points with velocity (P, D)."""
+def _response(axial: Tensor, acquisition: Acquisition, clutter: ClutterFilter | None) -> Tensor:
+    """Response (P,), dB, of the filter to echoes that move ``axial`` m per image along the beam."""
+    if clutter is None:
+        return torch.zeros_like(axial)
+    frequency = (axial * acquisition.phase_per_metre / (2 * math.pi)).double().cpu().numpy()
+    return decibel(torch.from_numpy(clutter.response(frequency)).clamp_min(1e-12)).to(axial)
+
+
+def _doubts(
+    velocity: Tensor, motion: Motion, snr: Tensor, response: Tensor, options: SpeckleTracker
+) -> Tensor:
+    """Flags (P,) of correlated points; velocity (P, D) m/s, power over noise (P,) and response (P,), dB."""
     flags = bit(~motion.sound, Flag.FLAT)
     # a fit that overshoots by 2 % of the range is still the range's own edge
     flags |= bit((velocity.abs() > options.search * 1.02).any(1) & motion.sound, Flag.EDGE)
+    if options.min_response is not None:
+        flags |= bit(response < options.min_response, Flag.STOPPED)
+    flags |= bit(motion.gap > TOLERATED_GAP, Flag.AMBIGUOUS)
     alone = (motion.lag == options.lags[0]) & (len(options.lags) > 1)
     least = torch.where(
         alone, max(options.lone_correlation, options.min_correlation), options.min_correlation
     )
-    return flags | bit(motion.correlation < least, Flag.DECORRELATED)
+    echoes = torch.nan_to_num(1 - 10 ** (-snr / 10), nan=1.0)  # share of the power that is not noise
+    floor = min(LEAST_CORRELATION, options.min_correlation)
+    return flags | bit(motion.correlation < (least * echoes).clamp_min(floor), Flag.DECORRELATED)

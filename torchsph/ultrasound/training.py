@@ -13,7 +13,10 @@ from geometry import Grid
 from .calibration import Calibration, fit_calibration
 from .echoes import EchoModel, simulate_packet
 from .estimates import Estimates
-from .tracking import SpeckleTracker
+from .plugin import Tracker
+
+IN_PLANE = 4
+FINEST, COARSEST = 0.25, 3.0  # 2 mm, which is twice a kernel of table 3.1, to 24 mm for the default plan
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +51,10 @@ def random_swirl(
     centre: tuple[float, ...], radius: float, speed: float, generator: torch.Generator,
     *, waves: int = 6, tissue_speed: float = 0.0,
 ) -> SwirlFlow:  # fmt: skip
-    """A swirl of RMS ``speed``, m/s, with wavelengths between one and three diameters of the ball.
+    """A swirl of RMS ``speed``, m/s, with wavelengths of ``FINEST`` to ``COARSEST`` diameters of the ball.
+
+    They are spread evenly on a logarithmic scale: vortices as large as a ventricle, shear layers that a kernel
+    hardly resolves.
 
     Each component of the tissue's velocity is drawn with a deviation of ``tissue_speed``, m/s.
     """
@@ -58,11 +64,8 @@ def random_swirl(
         return torch.randn(shape, generator=generator, dtype=torch.float64, device=generator.device)
 
     direction = torch.nn.functional.normalize(normal(waves, dimension), dim=1)
-    length = (
-        2
-        * radius
-        * (1 + 2 * torch.rand(waves, generator=generator, dtype=torch.float64, device=generator.device))
-    )
+    share = torch.rand(waves, generator=generator, dtype=torch.float64, device=generator.device)
+    length = 2 * radius * FINEST * (COARSEST / FINEST) ** share
     amplitude = normal(waves, dimension)
     amplitude = amplitude - (amplitude * direction).sum(1, keepdim=True) * direction
     mean = normal(dimension)
@@ -75,9 +78,9 @@ def random_swirl(
 
 @dataclass(frozen=True)
 class TrainingPlan:
-    """simulations: packets. radius: of the blood, m. margin: tissue around it in view, m. step: between
-    points, m.
+    """simulations: packets in space; a plane, which holds fewer points, takes ``IN_PLANE`` times as many.
 
+    radius: of the blood, m. margin: tissue around it in view, m. step: between points, m.
     slowest, fastest: RMS speeds, m/s, spread evenly over the simulations on a logarithmic scale.
     tissue_speed: deviation of each component of the tissue's velocity, m/s.
     """
@@ -111,7 +114,7 @@ def training_points(plan: TrainingPlan, centre: tuple[float, ...]) -> Tensor:
 
 
 def calibrate(
-    model: EchoModel, tracker: SpeckleTracker, spacing: tuple[float, ...], generator: torch.Generator,
+    model: EchoModel, tracker: Tracker, spacing: tuple[float, ...], generator: torch.Generator,
     plan: TrainingPlan = TrainingPlan(), *, centre: tuple[float, ...] | None = None,
 ) -> Calibration:  # fmt: skip
     """Fit deviations and weights of ``tracker`` on random swirls; image ``spacing`` x, y, z, m.
@@ -129,12 +132,13 @@ def calibrate(
     )
     points = training_points(plan, centre).to(generator.device)
     parts, errors = [], []
-    for number in range(plan.simulations):
-        share = number / (plan.simulations - 1)
+    simulations = plan.simulations * (IN_PLANE if grid.dimension == 2 else 1)
+    for number in range(simulations):
+        share = number / (simulations - 1)
         speed = plan.slowest ** (1 - share) * plan.fastest**share
         flow = random_swirl(centre, plan.radius, speed, generator, tissue_speed=plan.tissue_speed)
         estimates = tracker.track(simulate_packet(flow, grid, model, 0.0, generator), points)
         parts.append(estimates)
         errors.append(estimates.velocity - flow.velocity(points, 0.0).to(estimates.velocity))
-    beam = model.beams.directions(torch.cat([points] * plan.simulations)).to(errors[0])
+    beam = model.beams.directions(torch.cat([points] * simulations)).to(errors[0])
     return fit_calibration(Estimates.joined(parts), torch.cat(errors), beam)

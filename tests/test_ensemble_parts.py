@@ -1,0 +1,211 @@
+"""The parts of the ensemble's cycle: what is learned from innovations, what a measurement sees, who runs what."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+import geometry
+from regularize import Smoother
+from torchsph.assimilation import AssimilationError, LearnedGain, Reason, SpreadMatch
+from torchsph.data import sample_measurement
+from torchsph.members import shares
+from torchsph.metrics import divergence_rms, spread_over_skill
+from torchsph.observation_error import ObservationError
+from torchsph.observing import Source
+from torchsph.regions import flow_regions
+from torchsph.smooth import FrameSmoother
+from torchsph.solenoidal import without_divergence
+
+
+@pytest.fixture(scope="module")
+def measured():
+    return geometry.read_recording(sample_measurement()).select(slice(10, 12))
+
+
+def run_scalar(noise: float, forcing: float, decay: float, cycles: int, seed: int) -> tuple[LearnedGain, float]:
+    """Many independent scalar systems, x' = decay x + w, y = x + v, whose filter follows the learned gain."""
+    size, draw = 4000, torch.Generator().manual_seed(seed)
+
+    def white() -> torch.Tensor:
+        return torch.randn(size, generator=draw, dtype=torch.float64)
+
+    gain = LearnedGain(1, memory=20.0)
+    truth, guess, offered, weight = white(), torch.zeros(size, dtype=torch.float64), None, torch.ones(size)
+    for _ in range(cycles):
+        truth, guess = decay * truth + forcing * white(), decay * guess
+        innovation = truth + noise * white() - guess
+        if offered is not None:
+            gain.learn(offered, innovation, weight)
+        guess, offered = guess + float(gain.weight) * innovation, innovation[None]
+    prior = 1.0
+    for _ in range(200):  # the Riccati equation of the same system: what the Kalman filter's gain becomes
+        posterior = prior * noise**2 / (prior + noise**2)
+        prior = decay**2 * posterior + forcing**2
+    return gain, prior / (prior + noise**2)
+
+
+@pytest.mark.parametrize("noise,forcing", [(0.3, 0.3), (1.0, 0.3), (0.2, 0.6)])
+def test_the_learned_gain_becomes_the_kalman_gain(noise, forcing):
+    gain, kalman = run_scalar(noise, forcing, 0.98, 150, 0)
+    assert float(gain.weight) == pytest.approx(kalman, abs=0.04)
+
+
+def test_a_useless_increment_is_ignored_and_a_checkpoint_goes_on():
+    draw = torch.Generator().manual_seed(0)
+    gain, other = LearnedGain(2, 1, memory=15.0), LearnedGain(2, 1, memory=15.0)
+    for cycle in range(80):
+        error, junk = torch.randn(2, 2000, generator=draw, dtype=torch.float64)
+        offered = torch.stack([error, junk])
+        left = error - gain.weight @ offered + 0.3 * torch.randn(2000, generator=draw, dtype=torch.float64)
+        gain.learn(offered, left, torch.ones(2000))
+        if cycle == 40:
+            other.restore(gain.state())
+        elif cycle > 40:
+            other.learn(offered, left, torch.ones(2000))
+    assert gain.weight.tolist() == pytest.approx([1.0, 0.0], abs=0.05)
+    assert torch.equal(gain.weight, other.weight)
+    gain.learn(offered, left, torch.zeros(2000))  # nothing was observed: nothing is learned
+    assert torch.equal(gain.weight, other.weight)
+    with pytest.raises(AssimilationError, match="do not belong together"):
+        gain.learn(offered, left[1:], torch.ones(2000))
+    with pytest.raises(AssimilationError, match="LearnedGain needs"):
+        LearnedGain(0)
+
+
+def test_the_spread_becomes_that_of_the_errors():
+    """Errors of deviation 0.4 under noise of 0.8, members that start at 0.1; the estimator halves what it sees."""
+    draw, match = torch.Generator().manual_seed(0), SpreadMatch(memory=5.0, smallest=0.1, largest=10.0)
+    best = 0.4**2 / (0.4**2 + 0.8**2) / 0.5
+    for _ in range(80):
+        error, noise, anomaly = torch.randn(3, 3000, generator=draw, dtype=torch.float64)
+        anomaly = 0.1 * match.factor * anomaly
+        found = 0.5 * (0.4 * error + 0.8 * noise)
+        match.learn(float(best * (found * found).sum()), float((0.5 * anomaly * anomaly).sum()))
+    assert 0.1 * match.factor == pytest.approx(0.4, rel=0.1)
+    again = SpreadMatch()
+    again.restore(match.state())
+    assert again.factor == match.factor
+
+
+def plain_error(recording, **more) -> ObservationError:
+    frames, shape = recording.frames, recording.grid.shape
+    return ObservationError(np.full((frames, 3), 0.05), np.ones(frames), np.ones((frames, *shape)), **more)
+
+
+def linear_field(grid: geometry.Grid) -> torch.Tensor:
+    """(1, 3, *shape) with v = (1 + 20 y, 2 - 10 z, 30 x)."""
+    x, y, z = (grid.nodes()[:, k].reshape(grid.shape) for k in range(3))
+    return torch.stack([1 + 20 * y, 2 - 10 * z, 30 * x])[None]
+
+
+def test_a_source_sees_its_own_nodes_its_beam_and_its_blur(measured):
+    mask = torch.ones(measured.grid.shape, dtype=torch.bool)
+    field = linear_field(measured.grid)
+    shifted = geometry.Grid(tuple(o + 0.4e-3 for o in measured.grid.origin), (2e-3,) * 3, (14, 8, 8))
+    inside = np.ones((2, *shifted.shape), bool)
+    beam = np.zeros((3, *shifted.shape), np.float32)
+    beam[1], beam[2] = 0.6, 0.8
+    other = geometry.Recording(
+        time=measured.time, grid=shifted, velocity=np.zeros((2, 3, *shifted.shape), np.float32), mask=inside,
+        wall=measured.wall, rho=measured.rho, mu=measured.mu, beam=beam,
+    )
+    source = Source(other, plain_error(other), measured.grid)
+    seen = source.see(0)
+    exact = linear_field(shifted)[0]
+    along = (0.6 * exact[1] + 0.8 * exact[2]).flatten()
+    torch.testing.assert_close(source.predict(field, mask, seen)[0], along, rtol=1e-5, atol=1e-6)
+    assert seen.parts == 1 and source.groups == 1
+    # far from the edges a Gaussian leaves a linear field as it is, and lowers a wave by exp(-k^2 s^2 / 2)
+    blurred = Source(measured, plain_error(measured, kernel=2.5e-3), measured.grid)
+    seen = blurred.see(0)
+    wave = torch.cos(2 * math.pi / 8e-3 * measured.grid.nodes()[:, 2]).reshape(measured.grid.shape)
+    fields = torch.cat([field, wave.expand(1, 3, *wave.shape)])
+    linear, damped = blurred.predict(fields, mask, seen).reshape(2, 3, -1)
+    k, j, i = np.unravel_index(seen.node.numpy(), measured.grid.shape)
+    deep = torch.from_numpy((k > 5) & (k < 27) & (j > 5) & (j < 14) & (i > 5) & (i < 14))
+    exact = field.flatten(2)[0][:, seen.node][:, deep].double()
+    torch.testing.assert_close(linear[:, deep], exact, rtol=1e-4, atol=1e-5)
+    factor = math.exp(-0.5 * (2 * math.pi / 8e-3 * 2.5e-3 / 2.3548) ** 2)
+    torch.testing.assert_close(damped[0, deep], factor * wave.flatten()[seen.node][deep].double(), rtol=2e-2, atol=2e-2)
+
+
+def test_missing_values_come_with_their_reason(measured):
+    velocity, weight = measured.velocity.copy(), np.array(measured.weight)
+    k, j, i = np.argwhere(measured.mask[0] & (weight[0] > 0))[[3, 9]].T
+    velocity[0, 0, k[0], j[0], i[0]] = np.nan
+    weight[0, k[1], j[1], i[1]] = 0.0
+    holed = replace(measured, velocity=velocity, weight=weight)
+    seen = Source(holed, plain_error(holed), holed.grid).see(0)
+    flat = np.ravel_multi_index((k, j, i), measured.grid.shape)
+    codes = seen.observations.codes().reshape(3, -1)
+    assert (codes[:, seen.node == int(flat[0])] == Reason.MISSING).all()
+    assert (codes[:, seen.node == int(flat[1])] == Reason.NO_WEIGHT).all()
+    assert (seen.confidence[torch.isin(seen.node, torch.from_numpy(flat))] == 0).all()
+
+
+@pytest.mark.parametrize(
+    "members,cost,processes", [(16, 16.0, 1), (16, 16.0, 2), (16, 1.0, 4), (2, 16.0, 5), (7, 0.5, 3)]
+)
+def test_every_member_runs_once_and_the_loads_are_even(members, cost, processes):
+    todo = shares(members, cost, processes)
+    assert [lead for lead, _ in todo] == [True] + [False] * (processes - 1)
+    assert [k for _, part in todo for k in range(part.start, part.stop)] == list(range(members))
+    whole = shares(members, cost, processes, 3)
+    assert [k for _, part in whole for k in range(part.start, part.stop)] == list(range(members))
+    assert all(part.start % 3 == 0 or part.start == members for _, part in whole)
+    loads = [part.stop - part.start + cost * lead for lead, part in todo]
+    assert max(loads) <= max(cost, math.ceil((members + cost) / processes) + 1)
+
+
+def test_draws_have_the_deviation_that_the_posterior_states(measured):
+    splines = FrameSmoother(measured, Smoother())
+    fitted = splines.fit(0, uncertainty=True)
+    mask = torch.from_numpy(np.array(measured.mask[0], bool))
+    draws = splines.draws(fitted, 0, 40, torch.Generator().manual_seed(0))[:, :, mask]
+    stated = fitted.std(splines.nodes[mask.flatten()]).T.double()
+    # the mean over thousands of nodes of 40 draws' variance; neighbours share their errors
+    assert float(draws.square().mean().sqrt()) == pytest.approx(float(stated.square().mean().sqrt()), rel=0.1)
+    assert float(draws.mean(0).square().mean().sqrt()) < 2 * float(stated.square().mean().sqrt()) / 40**0.5
+
+
+def test_removing_divergence_is_a_projection():
+    """A discrete curl has no divergence by central differences and stays; a gradient goes with its divergence."""
+    axis = np.linspace(-1, 1, 20)
+    z, y, x = np.meshgrid(axis, axis, axis, indexing="ij")
+    mask, spacing = x**2 + y**2 + z**2 < 0.8, (1e-3,) * 3
+    potential = np.sin(3 * x) * np.cos(2 * y) * np.cos(z)
+    turning = np.stack([np.gradient(potential, 1e-3, axis=1), -np.gradient(potential, 1e-3, axis=2), 0 * x])
+    kept = without_divergence(turning, mask, spacing)
+    np.testing.assert_allclose(kept[:, mask], turning[:, mask], atol=1e-6 * np.abs(turning).max())
+    field = turning + 40.0 * np.stack([x * y, x - y**2, z * x])
+    clean = without_divergence(field, mask, spacing)
+    before, after = (divergence_rms(f[None], mask[None], spacing).value for f in (field, clean))
+    assert after < 0.12 * before
+    assert np.abs(clean[:, ~mask]).max() == 0.0
+    # of all fields without divergence it is the nearest: the change is orthogonal to what is left of it
+    change, kept = (field - clean)[:, mask], turning[:, mask]
+    assert abs(float((change * kept).sum())) < 1e-3 * np.linalg.norm(change) * np.linalg.norm(kept)
+
+
+def test_regions_of_a_ventricle(measured):
+    surface = geometry.WallMotion.from_recording(measured).surface(float(measured.time[0]))
+    position = measured.grid.nodes()[torch.from_numpy(np.flatnonzero(measured.mask[0]))]
+    speed = torch.linspace(0, 1, len(position))
+    found = flow_regions(surface, position, speed, 1e-3)
+    assert set(found) == {"jet", "near wall", "apex"}
+    assert torch.equal(found["jet"], speed > 0.5)
+    orifice = surface.centroids[surface.region > 0].mean(0)
+    distance = np.linalg.norm(position.numpy() - orifice, axis=1)
+    assert distance[found["apex"].numpy()].min() > np.median(distance)
+    assert 0.1 < found["near wall"].double().mean() < 0.9
+
+
+def test_spread_over_skill_of_a_known_error(measured):
+    sigma = np.full_like(measured.velocity, 0.03)
+    wrong = measured.with_velocity(np.nan_to_num(measured.velocity) + np.float32(0.06), sigma=sigma)
+    right = measured.with_velocity(np.nan_to_num(measured.velocity))
+    assert spread_over_skill(wrong, right).value == pytest.approx(0.5, rel=1e-3)
+    assert spread_over_skill(right, right) is None

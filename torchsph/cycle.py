@@ -1,0 +1,327 @@
+"""One cycle of the ensemble: forecast, look, analyse, learn; and everything that has to survive a restart."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+import geometry
+
+from .assimilation import (
+    Analysis,
+    Augmentation,
+    ErrorScale,
+    Filter,
+    FilterRecord,
+    LearnedGain,
+    Reason,
+    SpreadMatch,
+    concatenate,
+    replace_failed,
+)
+from .ensemble_options import EnsembleOptions
+from .innovation_spline import InnovationSpline, Look
+from .members import Ensemble, Forecaster, Forecasts
+from .observing import Seen, Source
+from .perturbations import flow_perturbations
+from .regions import flow_regions
+from .smooth import FrameSmoother
+from .solenoidal import without_divergence
+from .ultrasound.fields import fwhm_to_deviation
+
+# share of the forecast's error variance that an analysis leaves at least
+_LEAST_LEFT = 0.25
+
+
+class Cycle:
+    """The ensemble on its way through the frames of the first source, whose grid and mask are the state's.
+
+    Args:
+        sources: measurements, the first one gives the state's grid, mask, walls and times of analysis.
+        splines: of the first source. forecaster: runs the members. filter_: any filter of ``assimilation``.
+        truth: for the record's scores alone; it never enters an analysis.
+    """
+
+    def __init__(
+        self, sources: Sequence[Source], splines: FrameSmoother, forecaster: Forecaster, filter_: Filter,
+        options: EnsembleOptions, *, members: int, usual: float, truth: geometry.Recording | None = None, seed: int = 0,
+    ) -> None:
+        self.sources, self.splines, self.forecaster = list(sources), splines, forecaster
+        self.filter, self.options, self.count, self.usual = filter_, options, members, usual
+        self.measured, self.grid, self.truth = splines.recording, splines.recording.grid, truth
+        self.nodes = self.grid.nodes()
+        self.generator = torch.Generator().manual_seed(seed)
+        self.augmentation = Augmentation(tuple(one.parameter for one in options.estimated))
+        self.gain = LearnedGain(len(options.increments), self.grid.dimension, memory=options.memory)
+        self.spread = SpreadMatch()
+        self.first_group = np.cumsum([0] + [source.groups for source in self.sources]).tolist()
+        self.scale = ErrorScale(self.first_group[-1], memory=options.memory)
+        self.record = FilterRecord(seed=seed)
+        self.spline = InnovationSpline(splines, options.choose_every)
+        self.offered: Tensor | None = None  # (J, D, *shape) increments of the last analysis
+        self.fields: list[Tensor] = []
+        self.sigmas: list[Tensor] = []
+        self.missing: list[int] = []
+        self.events: list[dict[str, Any]] = []
+        self.ensemble: Ensemble | None = None
+
+    @property
+    def done(self) -> int:
+        """Frames that have their analysis."""
+        return len(self.fields)
+
+    def mask(self, frame: int) -> Tensor:
+        return torch.from_numpy(np.array(self.measured.mask[frame], bool))
+
+    def begin(self) -> None:
+        """The first frame: its spline and draws from the spline's posterior; walls alone where it measured nothing."""
+        mask = self.mask(0)
+        if self.splines.measures(0):
+            fitted = self.splines.fit(0, uncertainty=True)
+            control = torch.from_numpy(self.splines.on_grid(fitted, 0))
+            draws = self.splines.draws(fitted, 0, self.count, self.generator).to(control.dtype)
+        else:
+            control = torch.zeros((self.grid.dimension, *self.grid.shape))
+            draws = self._perturbations(0, self.usual)
+        parameters = {one.parameter.name: one.draw(self.count, self.generator) for one in self.options.estimated}
+        self.ensemble = Ensemble(control, control + draws, parameters).centred()
+        self._keep(control, torch.where(mask, self.ensemble.members.std(0), 0.0), 0)
+
+    def step(self, frame: int) -> None:
+        """From the analysis of the frame before to that of ``frame``."""
+        before, now = (float(t) for t in self.measured.time[frame - 1 : frame + 1])
+        early, late = self.mask(frame - 1), self.mask(frame)
+        seen = [
+            (source, source.see(number), float(source.recording.time[number]))
+            for source in self.sources for number in source.frames_within(before, now)
+        ]
+        times = sorted({time for _, _, time in seen if time < now - 1e-6}) + [now]
+        masks = [early | late] * (len(times) - 1) + [late]
+        forecasts = self.forecaster.advance(self.ensemble, before, early, times, masks)
+        states = self._prepared(forecasts, frame)
+        look = self._look([(source, what, _nearest(times, time)) for source, what, time in seen], states, masks, frame)
+        missing = int((late & ~forecasts.covered).sum())
+        if look is None:
+            self.offered = None
+            self._coast(states[-1], late, missing, now)
+        else:
+            self._analyse(states, masks, look, frame, missing)
+
+    # --- forecast -------------------------------------------------------------------------------------
+
+    def _perturbations(self, frame: int, amplitude: float) -> Tensor:
+        length = self.options.length
+        if length is None:
+            length = max(fwhm_to_deviation(self.sources[0].kernel), float(np.mean(self.grid.spacing)))
+        return flow_perturbations(
+            self.count, np.array(self.measured.mask[frame], bool), self.grid.spacing, amplitude, length, self.generator
+        ).to(torch.float32)
+
+    def _prepared(self, forecasts: Forecasts, frame: int) -> list[Ensemble]:
+        """Forecasts with failed members replaced, model error added, and the spread that the innovations ask for."""
+        states, time = forecasts.states, float(self.measured.time[frame])
+        if forecasts.control_failed:
+            self.events.append({"time": time, "failed": "control", "donor": "mean of the members"})
+        if bool(forecasts.failed.any()):
+            states = self._replaced(states, forecasts.failed, frame)
+        mask = self.mask(frame)
+        rms = max(float(states[-1].control[:, mask].square().mean().sqrt()), self.usual)
+        share = self.options.model_error
+        noise = self._perturbations(frame, share * rms) if share > 0 else 0.0
+        prepared = []
+        for state in states:
+            anomalies = state.members - state.members.mean(0) + noise
+            prepared.append(replace(state, members=state.control + self.spread.factor * anomalies))
+        return prepared
+
+    def _replaced(self, states: list[Ensemble], failed: Tensor, frame: int) -> list[Ensemble]:
+        time = float(self.measured.time[frame])
+        members = torch.stack([state.members for state in states], 1)
+        if int((~failed).sum()) < 2:  # too few to draw from: a new ensemble around the control
+            fresh = self._perturbations(frame, self.usual)
+            members = torch.stack([state.control + fresh for state in states], 1)
+            self.events.append({"time": time, "failed": torch.nonzero(failed).flatten().tolist(), "donor": "control"})
+        else:
+            repaired = replace_failed(members.flatten(1), failed, self.generator)
+            members = repaired.ensemble.reshape(members.shape)
+            self.events += [{"time": time, "failed": e.member, "donor": e.donor} for e in repaired.events]
+        return [replace(state, members=members[:, k]) for k, state in enumerate(states)]
+
+    # --- observations ---------------------------------------------------------------------------------
+
+    def _look(
+        self, parts: list[tuple[Source, Seen, int]], states: list[Ensemble], masks: list[Tensor], frame: int
+    ) -> Look | None:
+        parts = [part for part in parts if len(part[1].position)]
+        if not parts:
+            return None
+        group = torch.cat([
+            torch.arange(seen.parts).repeat_interleave(len(seen.position))
+            + self.first_group[self.sources.index(source)] for source, seen, _ in parts
+        ])  # fmt: skip
+        observations = self.scale.apply(concatenate([seen.observations for _, seen, _ in parts]), group)
+        members = torch.cat([source.predict(states[k].members, masks[k], seen) for source, seen, k in parts], 1)
+        return Look(parts, observations, group, members, self._regions(parts, states[-1].control, frame))
+
+    def _regions(self, parts: list[tuple[Source, Seen, int]], control: Tensor, frame: int) -> dict[str, Tensor]:
+        surface = self.splines.motion.surface(float(self.measured.time[frame]))
+        speed = control.norm(dim=0)[None]
+        found = [
+            {name: mask.repeat(seen.parts) for name, mask in flow_regions(
+                surface, seen.position, self.grid.sample(speed, seen.position)[0], float(min(self.grid.spacing))
+            ).items()}
+            for _, seen, _ in parts
+        ]
+        return {name: torch.cat([one[name] for one in found]) for name in found[0]}
+
+    # --- analysis -------------------------------------------------------------------------------------
+
+    def _analyse(
+        self, states: list[Ensemble], masks: list[Tensor], look: Look, frame: int, missing: int
+    ) -> None:
+        mask, state = masks[-1], states[-1]
+        inside = torch.nonzero(mask.flatten()).squeeze(1)
+        forecast = state.members.flatten(2)[:, :, inside].flatten(1)
+        size, positions = forecast.shape[1], self.nodes[inside]
+        joint = forecast
+        if state.parameters:
+            joint = self.augmentation.join(forecast, state.parameters)
+            positions = self.augmentation.positions(positions, size)
+        analysis = self.filter.analyse(
+            joint, look.members, look.observations, state_positions=positions, generator=self.generator
+        )
+        self._record(analysis, look, forecast, inside, frame)
+        weight = self._weights(analysis, look)
+        if self.offered is not None:
+            self.gain.learn(self._seen(self.offered, masks, look), torch.nan_to_num(analysis.innovation), weight)
+        self.offered = self._increments(analysis, look, inside, state.control, frame)
+        change = torch.einsum("j,jd...->d...", self.gain.weight.to(torch.float32), self.offered)
+        self._match_spread(masks, look, weight, frame)
+        self.scale.learn(analysis, look.observations, look.group)
+        control = state.control + change
+        anomalies, parameters = self._on_grid(analysis.ensemble[:, :size] - analysis.mean[:size], inside), {}
+        left = self._left(look, self._seen(anomalies, masks, look), self._seen(change[None], masks, look)[0], weight)
+        anomalies = left * anomalies
+        if state.parameters:
+            _, parameters = self.augmentation.split(analysis.ensemble)
+        self.ensemble = Ensemble(control, control + anomalies, parameters)
+        sigma = left * self._on_grid(analysis.variance[:size].clamp_min(0).sqrt()[None], inside)[0]
+        self._keep(torch.where(mask, control, 0.0), sigma, missing)
+
+    def _weights(self, analysis: Analysis, look: Look) -> Tensor:
+        """(m,) inverse variances of the observations in use, 0 for the others; no place counts for another."""
+        used = (analysis.reason == Reason.USED) | (analysis.reason == Reason.OUT_OF_REACH)
+        variance = look.observations.variance.double()
+        fine = used & torch.isfinite(analysis.innovation) & torch.isfinite(variance)
+        return torch.where(fine, 1.0 / variance, 0.0)
+
+    def _seen(self, fields: Tensor, masks: list[Tensor], look: Look) -> Tensor:
+        """(J, m) fields (J, D, *shape) where they are observed; 0 where nothing of them is."""
+        return torch.nan_to_num(
+            torch.cat([source.predict(fields, masks[k], seen) for source, seen, k in look.parts], 1)
+        )
+
+    def _increments(
+        self, analysis: Analysis, look: Look, inside: Tensor, control: Tensor, frame: int
+    ) -> Tensor:
+        """(J, D, *shape) increments, each with one component alone, in the order of ``options.increments``."""
+        parts = self.grid.dimension
+        found = []
+        for name in self.options.increments:
+            if name == "ensemble":
+                size = parts * len(inside)
+                moved = self._on_grid(analysis.mean[None, :size], inside)[0]
+                whole = torch.where(self.mask(frame), moved - control, 0.0)
+            else:
+                innovation = torch.nan_to_num(analysis.innovation)
+                whole = self.spline.of(innovation, self._weights(analysis, look), look, frame)
+            found.append(torch.diag_embed(whole.movedim(0, -1)).movedim((-2, -1), (0, 1)))
+        return torch.cat(found)
+
+    def _left(self, look: Look, anomalies: Tensor, change: Tensor, weight: Tensor) -> float:
+        """Factor on the analysed anomalies, seen (N, m), that leaves them what the analysis left of the error.
+
+        With weights that make the innovations white the error's variance falls by the increment's own; the filter
+        believes that it did more, because it takes its own increment for the one that was followed.
+        """
+        before = float((weight * look.members.double().var(0)).nan_to_num().sum())
+        after = float((weight * anomalies.double().var(0)).sum())
+        taken = float((weight * change.double().square()).sum())
+        target = max(before - taken, _LEAST_LEFT * before)
+        return (target / after) ** 0.5 if after > 0 else 1.0
+
+    def _match_spread(self, masks: list[Tensor], look: Look, weight: Tensor, frame: int) -> None:
+        """Compare what the spline finds in the innovations with what it finds in one draw from the ensemble."""
+        if "spline" not in self.options.increments:
+            return
+        parts, first = self.grid.dimension, self.options.increments.index("spline") * self.grid.dimension
+        seen = self._seen(self.offered, masks, look)
+        followed = self.gain.weight @ seen
+        shown = float((weight * seen[first : first + parts].sum(0) * followed).sum())
+        draw = torch.randn(self.count, generator=self.generator, dtype=torch.float64) / (self.count - 1) ** 0.5
+        anomaly = draw @ torch.nan_to_num(look.members - look.members.mean(0)).double()
+        found = self.spline.of(anomaly, weight, look, frame, learning=True)
+        self.spread.learn(shown, float((weight * self._seen(found[None], masks, look)[0] * anomaly).sum()))
+
+    def _coast(self, state: Ensemble, mask: Tensor, missing: int, time: float) -> None:
+        """Nothing was measured: the forecast is the analysis."""
+        self.ensemble = state
+        self.events.append({"time": time, "coasted": True})
+        self._keep(torch.where(mask, state.control, 0.0), torch.where(mask, state.members.std(0), 0.0), missing)
+
+    # --- accounts -------------------------------------------------------------------------------------
+
+    def _record(self, analysis: Analysis, look: Look, forecast: Tensor, inside: Tensor, frame: int) -> None:
+        time, right = float(self.measured.time[frame]), None
+        if self.truth is not None:
+            gaps = np.abs(self.truth.time - time)
+            if gaps.min() < 1e-6:
+                right = torch.from_numpy(self.truth.velocity[int(gaps.argmin())]).flatten(1)[:, inside].flatten()
+        self.record.add(
+            time, analysis, look.observations, regions=look.regions,
+            forecast=None if right is None else forecast, truth=right,
+        )
+        if not bool((self._weights(analysis, look) > 0).any()):
+            self.events.append({"time": time, "coasted": True})
+
+    def _on_grid(self, values: Tensor, inside: Tensor) -> Tensor:
+        """(k, D, *shape) from (k, D * inside), 0 outside."""
+        full = torch.zeros((len(values), self.grid.dimension, self.grid.size), dtype=torch.float32)
+        full[:, :, inside] = values.reshape(len(values), self.grid.dimension, -1).to(torch.float32)
+        return full.reshape(len(values), self.grid.dimension, *self.grid.shape)
+
+    def _keep(self, control: Tensor, sigma: Tensor, missing: int) -> None:
+        mask = np.array(self.measured.mask[len(self.fields)], bool)
+        clean = without_divergence(control.numpy(), mask, self.grid.spacing)
+        self.fields.append(torch.from_numpy(clean).to(torch.float32))
+        self.sigmas.append(sigma.to(torch.float32))
+        self.missing.append(missing)
+
+    def state(self) -> dict[str, Any]:
+        """Everything that the next step depends on, as tensors and plain values."""
+        return {
+            "ensemble": {"control": self.ensemble.control, "members": self.ensemble.members,
+                         "parameters": dict(self.ensemble.parameters)},
+            "generator": self.generator.get_state(), "gain": self.gain.state(), "spread": self.spread.state(),
+            "scale": self.scale.state(), "record": self.record.state(), "spline": self.spline.state(),
+            "offered": self.offered, "fields": list(self.fields), "sigmas": list(self.sigmas),
+            "missing": list(self.missing), "events": list(self.events),
+        }  # fmt: skip
+
+    def restore(self, state: dict[str, Any]) -> None:
+        self.ensemble = Ensemble(**state["ensemble"])
+        self.generator.set_state(state["generator"])
+        for name in ("gain", "spread", "scale", "record", "spline"):
+            getattr(self, name).restore(state[name])
+        self.offered = state["offered"]
+        self.fields, self.sigmas = list(state["fields"]), list(state["sigmas"])
+        self.missing, self.events = list(state["missing"]), list(state["events"])
+
+
+def _nearest(times: list[float], time: float) -> int:
+    return int(np.abs(np.array(times) - time).argmin())

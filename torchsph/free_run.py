@@ -1,0 +1,37 @@
+"""What walls and valves alone make of a beat: one simulation that never sees a measurement after its first frame."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from tqdm import tqdm
+
+import geometry
+
+from .simulator import Simulator
+
+
+def run_freely(
+    measured: geometry.Recording, model: Simulator, start: np.ndarray, *, seed: int = 0, progress: bool = False
+) -> geometry.Recording:
+    """Simulate the recording's beat from the velocity ``start`` (D, *shape), m/s, at its first frame.
+
+    The baseline of every assimilation: what of the flow follows from the walls' motion. Returns the fetched grids at
+    the recording's times.
+    """
+    time, grid = measured.time, measured.grid
+    run = model.start(float(time[0]), seed=seed)
+    run.impose(grid, torch.from_numpy(np.asarray(start, np.float32)).to(model.device)[None],
+               torch.from_numpy(np.array(measured.mask[0], bool)).to(model.device))
+    if run.can_project:
+        run.project(2)
+    fields, missing = [], []
+    for frame in tqdm(range(measured.frames), desc="free", unit="frame", disable=None if progress else True):
+        mask = torch.from_numpy(np.array(measured.mask[frame], bool)).to(model.device)
+        run.advance(float(time[frame]))
+        found = run.fetch(grid, mask)
+        fields.append(found.value[0].cpu().numpy())
+        missing.append(int((mask & ~found.covered[0]).sum()))
+    return measured.with_velocity(
+        np.stack(fields), uncovered=np.array(missing, np.int64), description="one SPH simulation without data"
+    )
