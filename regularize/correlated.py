@@ -6,18 +6,18 @@ posterior too narrow on long scales. Here the errors' covariance is taken as a w
 a Gaussian of the distance. Its size, share and length are those for which errors so drawn, sent through the fit, leave
 residuals like the ones that the data left (indirect inference: C. Gourieroux, A. Monfort and E. Renault, J. Appl.
 Econometrics 8, 1993, S85): the fit takes the long waves of the errors for flow, so that its residuals alone show less
-of them than there is. With what the penalties leave open drawn beside them, the draws have the covariance
-M^-1 (A'C A + P) M^-1 of the fit's error (the sandwich of P. Huber, Proc. Fifth Berkeley Symp. 1, 1967, 221), where C
-is the samples' covariance and P the penalties' precision; with independent errors it is the posterior's M^-1.
+of them than there is. What they add to the fit's variance, M^-1 A'(C - S) A M^-1 with the samples' covariance C and
+the white one S that the cost stands for, comes on top of the posterior's M^-1 (the sandwich of P. Huber, Proc. Fifth
+Berkeley Symp. 1, 1967, 221).
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 import torch
+from scipy.optimize import minimize_scalar
 from scipy.spatial import cKDTree
 
-from .block import BlockFactor
 from .direct import Factor
 from .operators import System, VectorRows
 from .ordering import Ordering
@@ -25,6 +25,7 @@ from .ordering import Ordering
 CENTRES = 500  # samples whose neighbours are looked at
 REACH = 6.0  # typical distances between samples over which correlation is looked for
 BINS = 12
+SHORTEST = 0.05  # length looked for, of the reach
 FAR = 3.0  # robust standard deviations at which residuals are cut: a hop is no correlated error
 FEWEST = 100  # samples
 DRAWS = 8
@@ -45,16 +46,19 @@ class Correlation:
 class _Pairs:
     """Pairs of samples, of which one is among CENTRES drawn at random, by distance."""
 
-    def __init__(self, points: np.ndarray) -> None:
+    def __init__(self, points: np.ndarray, used: np.ndarray) -> None:
+        # drawn from all samples: one that is discarded more or less does not change all the others
+        drawn = np.random.default_rng(0).permutation(len(points))
+        centres = (np.cumsum(used) - 1)[drawn[used[drawn]][:CENTRES]]
+        points = points[used]
         tree = cKDTree(points)
-        centres = np.random.default_rng(0).permutation(len(points))[:CENTRES]
         typical = float(np.median(tree.query(points[centres], k=2)[0][:, 1]))
-        near = tree.query_ball_point(points[centres], REACH * max(typical, 1e-12))
+        self.far = REACH * max(typical, 1e-12)
+        near = tree.query_ball_point(points[centres], self.far)
         first = np.repeat(centres, [len(each) for each in near])
         second = np.concatenate([np.asarray(each, int) for each in near])
         self.first, self.second = first[first != second], second[first != second]
         distance = np.linalg.norm(points[self.first] - points[self.second], axis=1)
-        self.far = float(distance.max(initial=typical))
         self.place = np.minimum(distance / self.far * BINS, BINS - 1).astype(int)
         self.count = np.bincount(self.place, minlength=BINS)
         self.middle = np.bincount(self.place, distance, BINS) / np.maximum(self.count, 1)
@@ -73,13 +77,22 @@ class _Pairs:
 
     def _gaussian(self, correlation: np.ndarray) -> tuple[float, float]:
         """Share in [0, 1] and length of share exp(-distance^2 / (2 length^2)), by least squares."""
-        best = (np.inf, 0.0, self.far)
-        for length in np.geomspace(0.05, 1.0, 60) * self.far:
+
+        def share(length: float) -> tuple[float, np.ndarray]:
             curve = np.exp(-0.5 * (self.middle / length) ** 2)
-            scale = (self.count * curve**2).sum()
-            share = float(np.clip((self.count * curve * correlation).sum() / max(scale, 1e-300), 0.0, 1.0))
-            best = min(best, (float((self.count * (correlation - share * curve) ** 2).sum()), share, float(length)))
-        return best[1], best[2]
+            best = (self.count * curve * correlation).sum() / max((self.count * curve**2).sum(), 1e-300)
+            return float(np.clip(best, 0.0, 1.0)), curve
+
+        def misfit(logarithm: float) -> float:
+            part, curve = share(np.exp(logarithm))
+            return float((self.count * (correlation - part * curve) ** 2).sum())
+
+        grid = np.log(self.far) + np.linspace(np.log(SHORTEST), 0.0, 30)
+        place = int(np.argmin([misfit(each) for each in grid]))
+        # between the grid's points, so that the answer follows the data without jumps
+        bounds = grid[max(place - 1, 0)], grid[min(place + 1, len(grid) - 1)]
+        length = float(np.exp(minimize_scalar(misfit, bounds=bounds, method="bounded", options={"xatol": 1e-6}).x))
+        return share(length)[0], length
 
 
 class CorrelatedErrors:
@@ -89,7 +102,7 @@ class CorrelatedErrors:
     """
 
     def __init__(
-        self, system: System, ordering: Ordering, factor: Factor | BlockFactor, weight: torch.Tensor, precision: float
+        self, system: System, ordering: Ordering, factor: Factor, weight: torch.Tensor, precision: float
     ) -> None:
         self.system, self.ordering, self.factor, self.precision = system, ordering, factor, precision
         self.fit: VectorRows = system.blocks[0]
@@ -108,7 +121,7 @@ class CorrelatedErrors:
         used = self.weight[:, 0, 0] > 0
         if int(used.sum()) < FEWEST or not bool((residual[used].abs().median(dim=0).values > 0).all()):
             return torch.ones(residual.shape[1], dtype=torch.float64)
-        pairs = _Pairs(self.points[used].numpy())
+        pairs = _Pairs(self.points.numpy(), used.numpy())
         errors = seen = pairs.correlation((self.weight * residual[:, :, None])[used])
         for _ in range(ROUNDS):
             drawn, fitted = self._fitted_errors(errors)
@@ -123,17 +136,11 @@ class CorrelatedErrors:
 
     def _spread(self, fitted: torch.Tensor) -> torch.Tensor:
         """Deviations with the fitted errors given, over those with the white ones that the posterior stands for."""
-
-        def white(*shape: int) -> torch.Tensor:
-            return torch.randn(shape, generator=self.generator, dtype=torch.float64) / self.precision**0.5
-
-        left_open = self.system.damping * white(self.fit.knots.nodes, self.system.components, DRAWS)
-        for draw in left_open.unbind(-1):
-            for block in self.system.blocks[1:]:
-                draw += block.rmatvec(white(len(block.target)))
-        noise = self._pulled(self.white / self.precision**0.5)  # the draws in the errors: their chance cancels
-        open_part, white_part = (self._fitted(each).square().mean((0, 2)) for each in (left_open, noise))
-        return ((open_part + fitted.square().mean((0, 2))) / (open_part + white_part)).sqrt().clamp(min=1.0)
+        white = self._fitted(self._pulled(self.white / self.precision**0.5))  # the draws in the errors: chance cancels
+        draws = [self.factor.sample(self.precision, self.generator) for _ in range(DRAWS)]
+        posterior = self._at_samples(torch.stack(draws, dim=-1))
+        more = fitted.square().mean((0, 2)) - white.square().mean((0, 2))
+        return (1.0 + more.clamp(min=0.0) / posterior.square().mean((0, 2))).sqrt()
 
     def _field(self, errors: Correlation) -> torch.Tensor:
         """(n, C, DRAWS) of variance 1: white, and plane waves with the spectrum of the correlated part."""
@@ -150,8 +157,11 @@ class CorrelatedErrors:
 
     def _fitted(self, right: torch.Tensor) -> torch.Tensor:
         """Fields (n, C, DRAWS) at the samples for right-hand sides (nodes, C, DRAWS)."""
-        solved = self.ordering.expand(self.factor.solve(right[self.ordering.nodes]))
-        return self.rows.matvec(solved.flatten(1)).view(len(self.fit), *right.shape[1:])
+        return self._at_samples(self.factor.solve(right[self.ordering.nodes]))
+
+    def _at_samples(self, x: torch.Tensor) -> torch.Tensor:
+        """Fields (n, C, DRAWS) at the samples of coefficients (active, C, DRAWS) in solve order."""
+        return self.rows.matvec(self.ordering.expand(x).flatten(1)).view(len(self.fit), *x.shape[1:])
 
 
 def _towards(errors: Correlation, seen: Correlation, left: Correlation) -> Correlation:

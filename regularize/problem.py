@@ -49,7 +49,7 @@ class Problem:
         along beams, over time and on a GPU.
         """
         data, system, fit = self.data, self.system, self.system.blocks[0]
-        if not isinstance(fit, VectorRows) or data.over_time or factor.ordering.nodes.device.type != "cpu":
+        if not isinstance(fit, VectorRows) or data.over_time or not isinstance(factor, Factor):
             return None
         fitted = fit.with_unit_weight().matvec(solution.x.view(system.knots.nodes, -1)).view_as(data.velocity)
         errors = CorrelatedErrors(system, factor.ordering, factor, data.weight, self.precision(solution))
