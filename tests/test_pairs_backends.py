@@ -284,10 +284,10 @@ def test_a_pressure_that_cannot_be_found_says_so(fast):
     spoilt = torch.nonzero(state.member == 0)[3]
     source[spoilt] = float("nan")
     every = torch.ones(len(source), dtype=torch.bool)
-    asked = {"free": every, "active": every, "singular": torch.ones(3, dtype=torch.bool), "tolerance": 1e-4}
+    asked = {"free": every, "active": every, "singular": torch.ones(3, dtype=torch.bool), "tolerance": 1e-3}
     few = fast.poisson(pairs, state, choice, source, None, iterations=3, **asked)
     assert few.converged.tolist() == [False, True, False] and few.iterations.tolist() == [0, 0, 3]
-    assert bool(torch.isnan(few.residual[0])) and float(few.residual[2]) > 1e-4
+    assert bool(torch.isnan(few.residual[0])) and float(few.residual[2]) > 1e-3
     enough = fast.poisson(pairs, state, choice, source, None, iterations=300, **asked)
     assert enough.converged.tolist() == [False, True, True]
     assert bool(torch.isfinite(enough.values[state.member > 0]).all())

@@ -12,6 +12,7 @@ from torchsph.pairs.interface import RateTerms
 from torchsph.particles import Particles
 from torchsph.projection import Neighbourhood
 from torchsph.scene import Fluid
+from torchsph.terms import LIMITS
 
 SIDE = 24
 SCHEME = Projection()
@@ -156,6 +157,51 @@ def test_a_closed_cavity_that_shrinks_is_reported_and_does_not_explode():
     assert not bool(run.record.failed.any()) and int(run.record.outside.sum()) == 0
     speed = run.particles.velocity[run.particles.inside].norm(dim=1) * run.units.speed
     assert float(speed.max()) < 10 * 2.0 * 6e-3
+
+
+@pytest.mark.parametrize("gap", [1.0, 6.0])
+def test_a_cavity_split_in_two(gap):
+    """Halves closer than a kernel, and so far apart that each has a constant of its own: nothing leaks, all converges.
+
+    The right half is at rest and stays so where no kernel reaches across: what does reach across is the price of walls
+    thinner than a kernel.
+    """
+    spacing = 1 / 16
+    half = geometry.polygon(np.array([[0, 0], [1, 0], [1, 1], [0, 1]], float), spacing / 2)
+    shift = 1 + gap * spacing
+    walls = geometry.Surface(
+        np.concatenate([half.vertices, half.vertices + [shift, 0.0]]),
+        np.concatenate([half.faces, half.faces + len(half.vertices)]),
+    )
+    scene = Scene(spacing=spacing, fluid=Fluid(1.0, 1e-3), walls=geometry.WallMotion.at_rest(walls), dimension=2)
+    run = Simulator(scene, Projection(max_step=5e-3), dtype=torch.float64).start(0.0)
+    p = run.particles
+    x, y = (math.pi * p.position * spacing).unbind(1)
+    left = p.position[:, 0] * spacing < 1 + 0.5 * gap * spacing
+    swirl = torch.stack([torch.sin(x) * torch.cos(y), -torch.cos(x) * torch.sin(y)], 1)
+    run = run.simulator.resume(p.changed(velocity=torch.where(left[:, None], swirl, 0.0 * swirl)), 0.0)
+    run.advance(0.3)
+    p = run.particles
+    assert int(run.record.unconverged) == 0 and int(run.record.outside.sum()) == 0
+    assert bool(((p.position[:, 0] * spacing < 1 + 0.5 * gap * spacing) == left).all())
+    assert float(p.velocity[left].norm(dim=1).max()) > 0.5
+    assert float(p.velocity[~left].norm(dim=1).max()) < (0.5 if gap < 2 else 0.05)
+
+
+def test_a_step_of_5_ms_is_cut_to_what_the_flow_allows():
+    """Asked for 5 ms in a scene of the heart's size and speed: limited by the flow, named in the record, no harm."""
+    ball = geometry.WallMotion.at_rest(geometry.ellipsoid((8e-3, 8e-3, 8e-3), 1.5e-3))
+    scene = Scene(spacing=1.5e-3, walls=ball)
+    run = Simulator(scene, Projection(max_step=5e-3)).start(0.0)
+    generator = torch.Generator().manual_seed(1)
+    noise = torch.randn(run.particles.velocity.shape, generator=generator)
+    run = run.simulator.resume(run.particles.changed(velocity=noise), 0.0)
+    energy = float(noise.square().sum())
+    run.advance(0.02)
+    assert int(run.record.steps) > 10 and int(run.record.outside.sum()) == 0 and not bool(run.record.failed.any())
+    assert float(run.particles.velocity.square().sum()) < energy
+    limited = dict(zip(LIMITS, run.record.limited_by[0].tolist(), strict=True))
+    assert limited["acoustic"] + limited["force"] > 0.8 * int(run.record.steps)
 
 
 def test_white_noise_dies_out_and_a_lone_particle_drifts_on():

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
+from .components import components
 from .incompressible import Projection
 from .integrate import Surroundings
 from .neighbours import PairSearch
@@ -122,19 +124,23 @@ class Neighbourhood:
         p, backend = self.particles, self.search.backend
         state, fluid = p.state(p.deviation), p.fluid
         coupled = fluid if held is None else fluid | held
-        free, singular = fluid, torch.ones(p.members, dtype=torch.bool, device=fluid.device)
-        if surface is not None:
-            free = fluid & ~surface
-            singular = p.per_member(surface.to(torch.int64), "sum") == 0
+        bound = torch.zeros_like(fluid) if surface is None else surface
         source = source * self.share
         if held is not None:
-            singular = singular & (p.per_member(held.to(torch.int64), "sum") == 0)
+            bound = bound | held
             kept = torch.where(held, start, torch.zeros_like(start))
             source = source - backend.laplacian(self.pairs, state, self.support, kept, coupled)[0]
-        found = backend.poisson(
-            self.pairs, state, self.support, source, start, free=free, active=coupled, singular=singular,
-            tolerance=tolerance, iterations=iterations,
-        )
+
+        def solved(group: Tensor, groups: int) -> PoissonSolution:
+            pinned = torch.zeros(groups, dtype=torch.int64, device=group.device).index_add(0, group, bound.long())
+            return backend.poisson(
+                self.pairs, state, self.support, source, start, free=fluid & ~bound, active=coupled,
+                singular=pinned == 0, tolerance=tolerance, iterations=iterations, group=group,
+            )
+
+        found = solved(p.member, p.members)
+        if not bool(found.converged.all()):
+            found = self._by_parts(found, coupled, solved)
         if held is not None:
             found = replace(found, values=found.values + kept)
         if self.wall is not None:
@@ -148,6 +154,31 @@ class Neighbourhood:
         slope = slope / self.share[:, None] if self.wall is not None else slope
         slope = torch.where(fluid[:, None], slope, torch.zeros_like(slope))
         return (slope if self.wall is not None else self._without_thrust(slope)), found
+
+    def _by_parts(
+        self, found: PoissonSolution, coupled: Tensor, solved: Callable[[Tensor, int], PoissonSolution]
+    ) -> PoissonSolution:
+        """What ``solved`` finds where each part that hangs together has a constant of its own; ``found`` if all do.
+
+        Looked for only where the solver failed: cavities in two halves and drops are rare, and finding them is slow.
+        """
+        p = self.particles
+        part, count = components(p.position, p.member, coupled, self.support.radius, self.search.period)
+        if count == p.members:
+            return found
+        apart = solved(part, count)
+        owner = torch.zeros(count, dtype=torch.int64, device=part.device).index_copy(0, part, p.member)
+
+        def of_members(values: Tensor, way: str, start: Tensor) -> Tensor:
+            return start.scatter_reduce(0, owner, values, way)
+
+        nothing = torch.zeros_like(found.residual)
+        largest = of_members(apart.mismatch.abs(), "amax", nothing)
+        return PoissonSolution(
+            apart.values, of_members(apart.iterations, "amax", found.iterations),
+            of_members(apart.residual, "amax", nothing),
+            of_members(apart.converged.long(), "amin", torch.ones_like(found.iterations)) > 0, largest,
+        )
 
     def _without_thrust(self, push: Tensor) -> Tensor:
         """``push`` (N, D) without its mean: pressure inside a fluid that touches nothing cannot move it as a whole.

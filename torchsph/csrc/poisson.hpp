@@ -45,7 +45,7 @@ struct Totals {
 // Vectors of the solver in the caller's order, kept between the calls of a thread.
 template <class Real> struct PoissonRoom {
   std::vector<Real> residual, direction, image, diagonal;
-  std::vector<double> mean, scale, left, fresh, old, curvature, along, beta, sums;
+  std::vector<double> mean, scale, left, begun, fresh, old, curvature, along, beta, sums;
   std::vector<std::uint8_t> active;
 };
 
@@ -71,6 +71,7 @@ template <class Real, int D> class Poisson {
   void run() {
     begin();
     auto& r = room;
+    r.begun = r.left;
     const double wanted = p.tolerance * p.tolerance;
     const auto going = [&](std::int64_t b) { return finite(r.left[b]) && r.left[b] > wanted * r.scale[b]; };
     for (std::int64_t b = 0; b < p.members; ++b) r.active[b] = going(b), p.count[b] = 0;
@@ -87,6 +88,7 @@ template <class Real, int D> class Poisson {
       descend();
       for (std::int64_t b = 0; b < p.members; ++b) r.active[b] = r.active[b] && going(b);
     }
+    keep_better();
     for (std::int64_t b = 0; b < p.members; ++b) {
       const bool known = finite(r.left[b]);
       p.residual[b] = known ? std::sqrt(r.left[b] / std::max(r.scale[b], least)) : std::numeric_limits<double>::quiet_NaN();
@@ -100,6 +102,19 @@ template <class Real, int D> class Poisson {
     for (const std::uint8_t flag : flags)
       if (flag) return true;
     return false;
+  }
+
+  // Where the residual has grown, as it may on a system without a solution, the start is the better answer.
+  void keep_better() {
+    auto& r = room;
+    bool worse = false;
+    for (std::int64_t b = 0; b < p.members; ++b) {
+      r.active[b] = finite(r.begun[b]) && !(finite(r.left[b]) && r.left[b] <= r.begun[b]);
+      if (r.active[b]) r.left[b] = r.begun[b], worse = true;
+    }
+    const Real* start = static_cast<const Real*>(p.start);
+    for (std::int64_t i = 0; worse && i < p.pass.particles; ++i)
+      if (r.active[p.member[i]]) values[i] = start && p.free[i] ? start[i] : Real(0);
   }
 
   // Sources without their mean where only differences of pressure count, the start's residual, the diagonal.

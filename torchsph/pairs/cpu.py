@@ -43,6 +43,12 @@ class ClusterPairs:
         return slot[slot >= 0].to(torch.int64)
 
     @property
+    def members(self) -> int:
+        """Number of members, but for those after the last that has particles."""
+        owner = self.lists[1]
+        return int(owner[-1]) + 1 if owner.numel() else 1  # clusters stand in order of their members
+
+    @property
     def bytes(self) -> int:
         """Memory of the lists."""
         entries = self.lists[2]
@@ -114,14 +120,12 @@ class CpuBackend(PlannedBackend):
         active: Tensor | None = None,
     ) -> list[Tensor]:
         kind, numbers = plan.kernel_choice(support, self.name)
-        owner = pairs.lists[1]
-        members = int(owner[-1]) + 1 if owner.numel() else 1  # clusters stand in order of their members
         return operators.pair_pass(
             pairs.lists,
             pairs.period,
             [request.terms, request.weight, request.form, kind],
             numbers,
-            plan.coefficients(support, request.momentum, members),
+            plan.coefficients(support, request.momentum, pairs.members),
             *(t.contiguous() for t in (state.position, state.velocity, state.mass, state.deviation)),
             state.pressure.contiguous() if request.terms & plan.PRESSURE else None,
             state.slope.contiguous() if request.terms & plan.CORRECTED_DIFFUSION else None,
@@ -131,14 +135,15 @@ class CpuBackend(PlannedBackend):
 
     def poisson(
         self, pairs: ClusterPairs, state: PairState, support: Support, source: Tensor, start: Tensor | None, *,
-        free: Tensor, active: Tensor, singular: Tensor, tolerance: float, iterations: int,
+        free: Tensor, active: Tensor, singular: Tensor, tolerance: float, iterations: int, group: Tensor | None = None,
     ) -> PoissonSolution:
         self.check(state.position, source, *(() if start is None else (start,)))
         self._check_state(pairs, state)
         kind, numbers = plan.kernel_choice(support, self.name)
+        group = state.member if group is None else group
         values, count, residual, converged, mismatch = operators.poisson(
-            pairs.lists, pairs.period, kind, numbers, plan.coefficients(support, None, singular.shape[0]),
-            *(t.contiguous() for t in (state.position, state.mass, state.deviation, state.member, source)),
+            pairs.lists, pairs.period, kind, numbers, plan.coefficients(support, None, pairs.members),
+            *(t.contiguous() for t in (state.position, state.mass, state.deviation, group, source)),
             None if start is None else start.contiguous(),
             *(t.contiguous() for t in (free, active, singular)), tolerance, iterations,
         )

@@ -188,7 +188,7 @@ def _pass_arguments(
 
 def poisson(
     lists: Sequence[Tensor], period: Sequence[float], kind: int, kernel: Sequence[float], coefficients: Tensor,
-    position: Tensor, mass: Tensor, deviation: Tensor, member: Tensor, source: Tensor, start: Tensor | None,
+    position: Tensor, mass: Tensor, deviation: Tensor, group: Tensor, source: Tensor, start: Tensor | None,
     free: Tensor, active: Tensor | None, singular: Tensor, tolerance: float, iterations: int,
 ) -> list[Tensor]:
     """Conjugate gradients for the Laplacian of the cluster lists; arguments as in ``Backend.poisson``.
@@ -196,19 +196,19 @@ def poisson(
     Not an operator of torch: how long it runs depends on the numbers.
 
     Returns:
-        values (N,); iterations int64, residual float64, converged bool and mismatch float64, (members,) each.
+        values (N,); iterations int64, residual float64, converged bool and mismatch float64, (groups,) each.
     """
-    members = singular.shape[0]
+    groups = singular.shape[0]
     choice = [plan.LAPLACIAN, plan.BY_VOLUME, 0, kind]
     given = _pass_arguments(
         lists, period, choice, kernel, coefficients, position, None, mass, deviation, active=active
     )
-    values, converged = torch.empty_like(source), torch.empty(members, dtype=torch.bool)
-    count = torch.empty(members, dtype=torch.int64)
-    residual, mismatch = (torch.empty(members, dtype=torch.float64) for _ in range(2))
+    values, converged = torch.empty_like(source), torch.empty(groups, dtype=torch.bool)
+    count = torch.empty(groups, dtype=torch.int64)
+    residual, mismatch = (torch.empty(groups, dtype=torch.float64) for _ in range(2))
     arguments = PoissonArguments(
         pass_=given, source=source.data_ptr(), start=_address(start), free=free.data_ptr(),
-        singular=singular.data_ptr(), member=member.data_ptr(), members=members, iterations=iterations,
+        singular=singular.data_ptr(), member=group.data_ptr(), members=groups, iterations=iterations,
         tolerance=tolerance, values=values.data_ptr(), count=count.data_ptr(), residual=residual.data_ptr(),
         mismatch=mismatch.data_ptr(), converged=converged.data_ptr(),
     )

@@ -239,19 +239,20 @@ class Backend(ABC):
 
     def poisson(
         self, pairs: Any, state: PairState, support: Support, source: Tensor, start: Tensor | None, *,
-        free: Tensor, active: Tensor, singular: Tensor, tolerance: float, iterations: int,
+        free: Tensor, active: Tensor, singular: Tensor, tolerance: float, iterations: int, group: Tensor | None = None,
     ) -> PoissonSolution:
-        """Solve ``laplacian`` u = ``source`` (N,) for each member by itself; a backend may do it in one piece.
+        """Solve ``laplacian`` u = ``source`` (N,) for each group by itself; a backend may do it in one piece.
 
         Args:
             start: (N,) or None for 0. free: (N,) bool, the unknowns; elsewhere u is 0. active: as in ``laplacian``.
-            singular: (members,) bool, where u is determined up to a constant and the mean of the source is taken out.
+            singular: (groups,) bool, where u is determined up to a constant and the mean of the source is taken out.
             tolerance: of the residual relative to the source. iterations: at most.
+            group: (N,) int64, sets of particles that do not interact; None: the members.
         """
         diagonal = self.laplacian(pairs, state, support, torch.zeros_like(source), active)[1]
         problem = PoissonProblem(
             lambda u: self.laplacian(pairs, state, support, u, active)[0], diagonal, state.mass, free, singular,
-            state.member, singular.shape[0],
+            state.member if group is None else group, singular.shape[0],
         )
         return solve(problem, source, start, tolerance=tolerance, iterations=iterations)
 

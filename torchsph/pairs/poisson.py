@@ -88,8 +88,8 @@ def solve(
         residual = source - p.image(values)
     scale = p.total(mass * source * source)
     wanted = tolerance**2 * scale
-    left = p.total(mass * residual * residual)
-    count = torch.zeros(p.members, dtype=torch.int64, device=source.device)
+    left = begun = p.total(mass * residual * residual)
+    count, begin = torch.zeros(p.members, dtype=torch.int64, device=source.device), values
     active, direction, old = left > wanted, zero, torch.ones_like(left)
     for _ in range(iterations):
         if not bool(active.any()):
@@ -106,5 +106,9 @@ def solve(
         count = count + active
         left = p.total(mass * residual * residual)
         active = active & (left > wanted) & torch.isfinite(left)
+    # where the residual has grown, as it may on a system without a solution, the start is the better answer
+    worse = torch.isfinite(begun) & ~(left <= begun)
+    values = torch.where(worse.index_select(0, p.member), begin, values)
+    left = torch.where(worse, begun, left)
     relative = torch.sqrt(left / scale.clamp_min(_TINY))
     return PoissonSolution(values, count, relative, left <= wanted, mean)
