@@ -68,8 +68,10 @@ class SplineField:
     def std(self, points: torch.Tensor, outside: float = float("nan"), *, blur: float = 0.0) -> torch.Tensor:
         """Posterior standard deviation (n, C) in m/s at points (n, A); fit with ``uncertainty=True``.
 
-        It is that of the random error: the samples' noise, and what the penalties leave open. What all samples
-        have in common is beyond the data, first of all that a measurement averages over its resolution cell.
+        It is that of the random error: the samples' noise, and what the penalties leave open. Of full-vector samples
+        in space, errors that neighbours share are found from the residuals and counted (see ``correlated``); of others
+        all are taken for independent. What all samples have in common is beyond the data, first of all that a
+        measurement averages over its resolution cell.
         ``blur``, the full width at half maximum of that cell in m, adds the square of the difference that a
         Gaussian of this width makes to the fit, s^2 / 2 times its Laplacian to leading order in its deviation s.
         It grows with the fit's own roughness, and errs on the small side where the finest scales are gone.

@@ -35,7 +35,7 @@ def cross_validate(search: LikelihoodSearch, no_slip: float | None, rounds: int)
         if not settled:
             search.reweigh(x)
     noise = (variance**0.5,) * search.components
-    return Choice(noise, length, no_slip, None, search.factor, count, settled)
+    return Choice(noise, length, no_slip, None, search.groups.order, search.factor, count, settled)
 
 
 def _evaluate(

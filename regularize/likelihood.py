@@ -12,7 +12,7 @@ level is read off scales that the spline resolves, where correlated noise looks 
 finer scales, which tells nothing about them, drops out.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
@@ -33,6 +33,7 @@ FLOOR = 1e-3  # slip precisions below this share of the data's no longer matter
 NOISE_FLOOR = 1e-4  # of the data's root mean square: exact data would send the precision to infinity
 SHARPEST = 0.01  # curvature lengths stay between this many knot spacings and its inverse
 LONGEST = 10.0  # divergence lengths stay below so many sides of the box: divergence-free data want an infinite one
+RATIOS = ("no_slip", "divergence")  # options whose squares are strengths relative to the samples'
 RIDGE = 0.02  # curvature length, in knot spacings, that keeps the unpenalised fit defined
 
 
@@ -43,16 +44,35 @@ class Choice:
     ``noise`` (C): white-equivalent standard deviation, per component, of a sample of full weight (larger than
     the point-wise one where the noise is correlated). ``curvature``, ``no_slip``, ``divergence``: the Smoother's
     options of that name (None: none to choose). ``robust`` (n,): factors on the squared rows of the samples.
-    ``rounds`` used; ``settled``: the last one changed nothing of note.
+    ``rounds`` used; ``settled``: the last one changed nothing of note. ``shared`` (C,): factors on ``noise`` for long
+    scales, where errors are correlated over several samples (see ``correlated``); they are in the other values.
     """
 
     noise: tuple[float, ...]
     curvature: float
     no_slip: float | None
     divergence: float | None
+    order: int
     robust: torch.Tensor
     rounds: int
     settled: bool
+    shared: tuple[float, ...] | None = None
+
+    @property
+    def deviation(self) -> torch.Tensor:
+        """(C,) m/s: ``noise`` with what neighbouring samples' errors have in common."""
+        return torch.tensor(self.noise, dtype=torch.float64) * torch.tensor(self.shared or 1.0, dtype=torch.float64)
+
+    def counting(self, shared: torch.Tensor) -> "Choice":
+        """The choice for samples whose errors disturb long scales ``shared`` (C,) times as much as ``noise`` says.
+
+        They then weigh less beside the penalties, whose own strengths stay.
+        """
+        noise = torch.tensor(self.noise, dtype=torch.float64)
+        less = float((noise**-2).mean() / ((noise * shared) ** -2).mean()) ** 0.5
+        stronger = {name: value and less * value for name, value in vars(self).items() if name in RATIOS}
+        curvature = self.curvature * less ** (1.0 / self.order)
+        return replace(self, curvature=curvature, shared=tuple(shared.tolist()), **stronger)
 
 
 @dataclass(frozen=True)
@@ -182,7 +202,7 @@ class LikelihoodSearch:
         noise_each = tuple((found.fit**-0.5).tolist())
         no_slip, divergence = ((each / scale) ** 0.5 if each > 0 else None for each in (found.slip, found.divergence))
         curvature = (found.rough / scale) ** (0.5 / self.groups.order)
-        return Choice(noise_each, curvature, no_slip, divergence, self.factor, count, settled)
+        return Choice(noise_each, curvature, no_slip, divergence, self.groups.order, self.factor, count, settled)
 
     def _round(self, now: Precisions) -> Precisions:
         prior, right = self.prior(now)

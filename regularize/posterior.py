@@ -15,10 +15,16 @@ from .knots import Knots
 
 
 class Posterior:
-    """Variances of the field; ``precision`` turns the normal matrix into that of a log-posterior."""
+    """Variances of the field; ``precision`` turns the normal matrix into that of a log-posterior.
 
-    def __init__(self, factor: Factor | BlockFactor, precision: float, components: int) -> None:
+    ``inflation`` (C,): factors on the standard deviations, for samples whose errors are correlated.
+    """
+
+    def __init__(
+        self, factor: Factor | BlockFactor, precision: float, components: int, inflation: torch.Tensor | None = None
+    ) -> None:
         self.ordering, self.components, self.precision = factor.ordering, components, precision
+        self.inflation = torch.ones(components, dtype=torch.float64) if inflation is None else inflation
         self._factor = factor
         self._blocks: list[tuple[torch.Tensor, torch.Tensor | None]] | None = None
 
@@ -33,7 +39,7 @@ class Posterior:
             here = slot == number
             covariance = self._cell_covariance(self.ordering.position[number])
             out[here] = torch.einsum("nl,clm,nm->nc", basis[here], covariance, basis[here])
-        return out / self.precision
+        return out / self.precision * self.inflation.to(out).square()
 
     def _cell_covariance(self, position: torch.Tensor) -> torch.Tensor:
         """(C, L, L) covariance of each component's coefficients in one cell, times the precision."""
@@ -44,10 +50,10 @@ class Posterior:
         first = int(unknown.min()) // size
         diagonal, below = self._blocks[first]
         local = unknown - first * size
-        if below is not None:
-            following = self._blocks[first + 1][0]
-            diagonal = torch.cat([torch.cat([diagonal, below.T], 1), torch.cat([below, following], 1)])
-        return torch.stack([diagonal[i][:, i] for i in local])
+        if below is None:
+            return torch.stack([diagonal[i][:, i] for i in local])
+        following = self._blocks[first + 1][0]
+        return torch.stack([_across(diagonal, below, following, i) for i in local])
 
     def _invert(self) -> list[tuple[torch.Tensor, torch.Tensor | None]]:
         """Blocks (k, k) and (k + 1, k) of the inverse, each as wide as the band."""
@@ -67,3 +73,12 @@ class Posterior:
             done.append((diagonal, below))
             following = diagonal
         return done[::-1]
+
+
+def _across(diagonal: torch.Tensor, below: torch.Tensor, following: torch.Tensor, i: torch.Tensor) -> torch.Tensor:
+    """Rows and columns i, rising, of the symmetric matrix of two blocks and the one below between them."""
+    size = len(diagonal)
+    own, other = i[i < size], i[i >= size] - size
+    between = below[other][:, own]
+    upper = torch.cat([diagonal[own][:, own], between.T], dim=1)
+    return torch.cat([upper, torch.cat([between, following[other][:, other]], dim=1)])

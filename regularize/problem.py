@@ -6,11 +6,12 @@ from math import prod
 import torch
 
 from .block import BlockFactor
+from .correlated import CorrelatedErrors
 from .direct import Factor, PreparedSystem, solve_direct
 from .field import SplineField
 from .krylov import Solution
 from .likelihood import Choice
-from .operators import System
+from .operators import System, VectorRows
 from .posterior import Posterior
 from .samples import FitData
 
@@ -33,10 +34,26 @@ class Problem:
         covered[self.system.cells()] = True
         posterior = None
         if factor is not None and own_factor:
-            posterior = Posterior(factor, self.precision(solution), self.system.components)
+            posterior = self.posterior(solution, factor)
         return SplineField(
             knots, coefficients, covered, solution, data.left_out, self.choice, posterior, factor
         )
+
+    def posterior(self, solution: Solution, factor: Factor | BlockFactor) -> Posterior:
+        """The posterior, with what the samples' errors are found to have in common."""
+        return Posterior(factor, self.precision(solution), self.system.components, self.shared(solution, factor))
+
+    def shared(self, solution: Solution, factor: Factor | BlockFactor) -> torch.Tensor | None:
+        """(C,) factors on the posterior's deviations for errors that samples share; None where they are not looked for:
+
+        along beams, over time and on a GPU.
+        """
+        data, system, fit = self.data, self.system, self.system.blocks[0]
+        if not isinstance(fit, VectorRows) or data.over_time or not isinstance(factor, Factor):
+            return None
+        fitted = fit.with_unit_weight().matvec(solution.x.view(system.knots.nodes, -1)).view_as(data.velocity)
+        errors = CorrelatedErrors(system, factor.ordering, factor, data.weight, self.precision(solution))
+        return errors.inflation(data.velocity - fitted)
 
     def precision(self, solution: Solution) -> float:
         """Turns the cost into minus twice a log-posterior: the weight of all samples over their variance.
@@ -47,7 +64,7 @@ class Problem:
         scale = self.data.weight.double().square().sum()
         scale = scale / (fit.weight.double().square().sum() / self.system.components)
         if self.choice is not None:
-            return float(scale * (torch.tensor(self.choice.noise, dtype=torch.float64) ** -2).mean())
+            return float(scale * (self.choice.deviation**-2).mean())
         residual = fit.target.double() - fit.matvec(solution.x.view(self.system.knots.nodes, -1))
         variance = residual.square().sum() / fit.weight.double().square().sum()
         return float(scale / variance.clamp(min=1e-300))

@@ -88,7 +88,7 @@ class FitData:
 
     def reweighed(self, choice: "Choice") -> "FitData":
         """With the robust factors and component noise that an automatic choice found."""
-        precision = torch.tensor(choice.noise, dtype=torch.float64) ** -2
+        precision = choice.deviation**-2
         each = (precision / precision.mean()).sqrt().to(self.points)
         # discarded samples stay as rows of weight 0: the field remains defined where they lie
         factor = choice.robust.sqrt().to(self.weight)

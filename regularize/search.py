@@ -5,12 +5,14 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from .direct import solve_direct
 from .gcv import cross_validate
 from .knots import Knots
 from .likelihood import Choice, Groups, LikelihoodSearch
 from .operators import CellRows, DivergenceRows, VectorRows
 from .penalties import row_factor
-from .rows import penalty_blocks, smoothness_gram, wall_roots
+from .problem import Problem
+from .rows import build_system, penalty_blocks, smoothness_gram, wall_roots
 from .samples import FitData
 
 if TYPE_CHECKING:
@@ -50,4 +52,13 @@ def choose(options: "Smoother", knots: Knots, data: FitData) -> Choice | None:
     with torch.no_grad():
         if options.automatic == "gcv":
             return cross_validate(search, options.no_slip, options.rounds)
-        return search.run(guess, options.curvature, options.no_slip, options.divergence, options.rounds)
+        choice = search.run(guess, options.curvature, options.no_slip, options.divergence, options.rounds)
+        return _counting_shared_errors(options, coarse, data, choice) if options.correlated else choice
+
+
+def _counting_shared_errors(options: "Smoother", coarse: Knots, data: FitData, choice: Choice) -> Choice:
+    """The choice with what neighbouring samples' errors are found to have in common in a fit on the search's grid."""
+    data = data.reweighed(choice)
+    problem = Problem(data, build_system(options.with_choice(choice), coarse, data), choice)
+    shared = problem.shared(*solve_direct(problem.system, strict=False))
+    return choice if shared is None else choice.counting(shared)

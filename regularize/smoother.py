@@ -61,6 +61,8 @@ class Smoother:
     or "huber" reweighting of outliers, found together with that choice. ``choose_divergence``: the likelihood
     chooses divergence too. Only for samples of independent errors: the likelihood takes the divergence of errors that
     are correlated over millimetres (speckle tracking) for flow, and settles on too weak a penalty.
+    ``correlated``: samples whose errors are found to be correlated over several samples (see ``correlated``) weigh
+    less beside the penalties; for full vectors in space, with automatic="likelihood".
     ``search_knots``: the choice is made on a grid this many times coarser, in at most ``rounds`` rounds.
     ``solver``: "direct", "direct32" (a float32 factor, refined to the tolerance: half the time on large grids),
     "lsqr", "lsmr", or "pcg" with a neighbouring frame's factor; "auto" is direct, or LSMR where the factor would fill
@@ -84,6 +86,7 @@ class Smoother:
     automatic: str | None = "likelihood"
     robust: str | None = "tukey"
     choose_divergence: bool = False
+    correlated: bool = True
     search_knots: float = 4 / 3
     rounds: int = 12
     scaling: str = "density"
@@ -152,6 +155,13 @@ class Smoother:
     def fixed(self, **changes: object) -> "Smoother":
         """The same options without automatic choice and reweighting, with ``changes``."""
         return replace(self, **{"automatic": None, "robust": None, "choose_divergence": False} | changes)
+
+    def with_choice(self, choice: Choice) -> "Smoother":
+        """The same options, fixed at what was chosen."""
+        in_time = None if self.time_curvature is None else choice.curvature / self.curvature * self.time_curvature
+        free = self.divergence if choice.divergence is None else choice.divergence
+        chosen = {"curvature": choice.curvature, "no_slip": choice.no_slip, "divergence": free}
+        return self.fixed(time_curvature=in_time, **chosen)
 
     def fit(
         self,
@@ -246,13 +256,8 @@ class Smoother:
         return self._with_choice(problem.system.knots, data, choice)
 
     def _with_choice(self, knots: Knots, data: FitData, choice: Choice) -> Problem:
-        stretch = choice.curvature / self.curvature
-        in_time = None if self.time_curvature is None else stretch * self.time_curvature
-        free = self.divergence if choice.divergence is None else choice.divergence
-        chosen = {"curvature": choice.curvature, "no_slip": choice.no_slip, "divergence": free}
-        options = self.fixed(time_curvature=in_time, **chosen)
         data = data.reweighed(choice)
-        return Problem(data, build_system(options, knots, data), choice)
+        return Problem(data, build_system(self.with_choice(choice), knots, data), choice)
 
     def _solver(self, system: System, needs_factor: bool) -> str:
         """The solver by name, chosen by size and memory where the option leaves it open."""

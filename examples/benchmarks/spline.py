@@ -105,13 +105,14 @@ def run_next_frame(rows: rg.System) -> dict:
 
 def run_new_weights(rows: rg.System, samples: int, nodes: tuple[int, ...]) -> dict:
     """The same positions, new weights: conjugate gradients with the first frame's factor."""
-    first, factor = rg.solve_direct(rows)
+    prepared = rg.PreparedSystem(rows)
+    first, factor = rg.solve_direct(prepared)
     generator = torch.Generator().manual_seed(9)
     change = torch.rand(samples, 1, generator=generator, dtype=torch.float64) + 0.5
     other = rg.System(rows.knots, 3, [rows.blocks[0].with_weight(change), *rows.blocks[1:]], rows.damping)
     start = clock()
     initial = first.x.view(-1, 3)
-    solution = rg.pcg(rg.PreparedSystem(other), factor, start=initial, tolerance=TOLERANCE)
+    solution = rg.pcg(prepared.with_weights(other), factor, start=initial, tolerance=TOLERANCE)
     return took(start) | {"gradient": relative_gradient(other, solution.x), "iterations": solution.iterations}
 
 
