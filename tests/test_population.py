@@ -12,7 +12,7 @@ from torchsph.particles import Particles
 from torchsph.scene import Fluid
 
 SIDE = {2: 24, 3: 10}
-SCHEMES = [("default", {"sound_speed": 10.0}), ("projection", {})]
+SCHEMES = [("weakly_compressible", {"sound_speed": 10.0}), ("projection", {})]
 DIMENSIONS = [2, 3]
 
 
@@ -125,7 +125,7 @@ def after_steps(scheme, options, dimension, what, centre, every):
 
 @pytest.mark.parametrize(
     ("scheme", "options", "dimension"),
-    [("default", {"sound_speed": 10.0, "shifting": None}, 2), ("projection", {}, 2), ("projection", {}, 3)],
+    [("weakly_compressible", {"sound_speed": 10.0, "shifting": None}, 2), ("projection", {}, 2), ("projection", {}, 3)],
 )
 def test_a_hole_closes_and_a_crowd_thins_while_the_flow_goes_on(scheme, options, dimension):
     """Within forty steps, over the seams of the box too; without the control both are still there.
@@ -174,7 +174,7 @@ def test_what_flows_through_valves_is_all_that_changes_the_mass():
     assert run.record.merged.tolist() == run.record.summary()["merged"] and int(run.record.outside.sum()) == 0
 
 
-@pytest.mark.parametrize("scheme", ["default", "projection"])
+@pytest.mark.parametrize("scheme", ["weakly_compressible", "projection"])
 def test_a_hole_at_a_wall_is_filled_and_nothing_lands_beyond(scheme):
     box = geometry.polygon(np.array([[0, 0], [1, 0], [1, 1], [0, 1]], float), 1 / 32)
     scene = Scene(spacing=1 / 16, walls=geometry.WallMotion.at_rest(box), dimension=2)

@@ -12,7 +12,7 @@ from torchsph import CompleteKernelWall, Scene, Simulator, preset
 from torchsph.scene import Fluid, Valve
 
 LENGTH = 1.0
-SCHEMES = [("default", {"sound_speed": 10.0}), ("projection", {"max_step": 5e-3})]
+SCHEMES = [("weakly_compressible", {"sound_speed": 10.0}), ("projection", {"max_step": 5e-3})]
 
 
 def duct(scheme, options, pressures, viscosity=0.0, stagnation=False, across=16, members=1, length=LENGTH):

@@ -154,7 +154,7 @@ def test_a_changed_parameter_is_the_scheme_with_that_parameter(name, backend):
 
 def test_changes_that_cannot_be():
     scene = Scene(spacing=1 / 12, period=(1.0, 1.0), dimension=2)
-    run = Simulator(scene, preset("default")).start(0.0, members=2)
+    run = Simulator(scene, preset("weakly_compressible")).start(0.0, members=2)
     with pytest.raises(ValueError, match="unknown parameter 'speed'; known: sound_speed"):
         run.change(speed=1.0)
     with pytest.raises(ValueError, match=r"needs one value, or 2 for the members, got \(3,\)"):
@@ -245,7 +245,7 @@ def test_sorting_in_space_leaves_the_caller_its_particles(monkeypatch):
     for least in (10**9, 0):
         monkeypatch.setattr(simulation, "_SORT_FROM", least)
         monkeypatch.setattr(simulation, "_SORT_EVERY", 2)
-        run = Simulator(scene, preset("default"), dtype=torch.float64).resume(start, 0.0)
+        run = Simulator(scene, preset("weakly_compressible"), dtype=torch.float64).resume(start, 0.0)
         for k in range(1, 4):
             run.advance(0.01 * k)
         moved = run._order is not None and not torch.equal(run._order, torch.arange(512))

@@ -22,7 +22,7 @@ class Simulator:
 
     Args:
         scene: fluid, walls, valves, forces (SI).
-        scheme: ``Projection`` or ``WeaklyCompressible`` options; None takes the default preset.
+        scheme: ``Projection`` or ``WeaklyCompressible`` options; None: the weakly compressible preset, for any scene.
         device, dtype: where and in what precision particles live (float32 or float64).
         backend: name of the pair backend, or "auto" for the best one present.
         seeding: how particles are placed; None takes what the scheme's walls call for.
@@ -37,7 +37,7 @@ class Simulator:
 
     def __post_init__(self) -> None:
         if self.scheme is None:
-            object.__setattr__(self, "scheme", preset("default"))
+            object.__setattr__(self, "scheme", preset("weakly_compressible"))
         if self.dtype not in (torch.float32, torch.float64):
             raise ValueError(f"Simulator.dtype must be torch.float32 or torch.float64, got {self.dtype}")
         choose_backend(self.backend, self.device)  # a missing backend must not surface in the middle of a run

@@ -82,8 +82,8 @@ def observed_order(spacings: list[float], errors: list[float]) -> float:
     return float((h * (e - e.mean())).sum() / (h * h).sum())
 
 
-# Changes of the default preset for flows it was not chosen for, each measured in tests/test_validation_*.py or
-# tests/test_simulator_hard_cases.py.
+# Changes of the weakly compressible preset for flows it was not chosen for, each measured in
+# tests/test_validation_*.py or tests/test_simulator_hard_cases.py.
 #
 # Vortices: what dissipates is not viscosity but disorder: the lattice breaks up along the strained directions, pressure
 # forces on uneven particles stir them, and viscosity consumes what is stirred. Switching bulk damping, density

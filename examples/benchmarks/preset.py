@@ -1,4 +1,4 @@
-"""Every component of the default preset against what it could be replaced by, on a ventricle and on a vortex.
+"""Components of the weakly compressible preset against what could replace them, on a ventricle and on a vortex.
 
     python examples/benchmarks/preset.py [--quick] [--json FILE] [--recording FILE] [--threads N]
 
@@ -138,8 +138,8 @@ QUICK = ("preset", "pressure", "shifting")
 
 
 def scheme(changes: dict[str, object]) -> Scheme:
-    """The default preset with changes, or another preset."""
-    return preset(changes["preset"]) if "preset" in changes else preset("default", **changes)
+    """The weakly compressible preset with changes, or another preset."""
+    return preset(changes["preset"]) if "preset" in changes else preset("weakly_compressible", **changes)
 
 
 def ventricle(recording: geometry.Recording, spacing: float, every: int, changes: dict[str, object]) -> dict:

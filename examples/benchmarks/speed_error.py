@@ -16,7 +16,7 @@ Measured (results/speed_error.json and .png): in the plane 1.1 % in 0.7 CPU seco
 There 0.7 of the speed of sound costs 0.7 and is no worse; a narrower kernel or twice the speed of sound is slower and
 worse, also in space. In space the incompressible scheme is as good as the options for periodic flows at a quarter of
 the time (24^3: 1.4 % in 1.2 s against 1.7 % in 5.6 s); in the plane it is behind. In the ventricle both schemes lie
-on one line, .18 and .20 in 3 s at 1.2 mm. The default preset, made for the ventricle, is poor for vortices in a
+on one line, .18 and .20 in 3 s at 1.2 mm. That preset is poor for vortices in a
 periodic box (16 % at 40^2: its shifting leaves disorder there). PySPH's vortex: peers_vortex.py.
 """
 
@@ -129,7 +129,9 @@ def ventricle(resolution: float, scheme: Scheme, backend: str, quick: bool) -> t
 
 
 # the incompressible scheme's longest step is one for the heart; here the flow's own speed limits it
-PRESET_CURVES = {"default preset": preset("default"), "projection": preset("projection", max_step=None)}
+PRESET_CURVES = {
+    "weakly compressible preset": preset("weakly_compressible"), "projection": preset("projection", max_step=None),
+}  # fmt: skip
 REFERENCE = {"reference backend": {"backend": "reference"}}
 FLOWS = {
     "plane": Flow(plane, WeaklyCompressible(**validation.PERIODIC_OPTIONS), (20, 40, 60), (16, 24), {
@@ -148,7 +150,7 @@ FLOWS = {
         "h = 1.3": {"smoothing_ratio": 1.3}, "position Verlet": {"order": "verlet"},
         "potential wall": {"wall": PotentialWall()},
     } | REFERENCE, "RMS error / largest velocity"),
-    "ventricle": Flow(ventricle, preset("default"), (2.0, 1.5, 1.2), (2.5,), {
+    "ventricle": Flow(ventricle, preset("weakly_compressible"), (2.0, 1.5, 1.2), (2.5,), {
         "sound speed 3.5": {"sound_speed": 3.5}, "sound speed 10": {"sound_speed": 10.0},
         "Wendland C4, h = 1.6": {"kernel": "wendland_c4", "smoothing_ratio": 1.6}, "h = 1.6": {"smoothing_ratio": 1.6},
         "position Verlet": {"order": "verlet"},

@@ -6,7 +6,7 @@ Pipe: relative L2 error of the velocity of steady flow, 16 particles across, fro
 0.5 s, --quick 0.1 s). Containers: RMS pressure error over rho g H and the largest speed over sqrt(g H), 12 across, 2 s
 (--quick 0.3 s, not settled) after gravity was switched on. Part of a step: CPU seconds of steps with walls less those
 of the same steps without, in a sphere of 16,800 particles. Fields: CPU seconds for one moment of a ventricle's walls.
-All options beside the wall are those of the default preset; potential walls start from their own random seeding.
+All options beside the wall are the scheme's own; potential walls start from their own random seeding.
 
 Measured on one core of a shared machine whose load was 7 to 9:
 
@@ -184,7 +184,7 @@ def ellipsoids(resolutions: tuple[int, ...]) -> dict[str, dict[str, float]]:
     """The ellipsoid with both schemes, printed as it goes."""
     rows = {}
     print(f"{'ellipsoid, ejection':<24} {'core':>7} {'volume':>7} {'CPU s':>7}")
-    for name in ("default", "projection"):
+    for name in ("weakly_compressible", "projection"):
         for across in resolutions:
             rows[f"{name}, {across}"] = row = ellipsoid(name, across)
             label = f"{name}, {across} across"
