@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -10,7 +10,7 @@ from scipy.special import eval_legendre
 
 import geometry
 
-from .presets import preset
+from .presets import Scheme, preset
 from .scene import Fluid, Scene, Valve
 from .schemes import CompleteKernelWall
 from .simulation import Simulation
@@ -89,13 +89,14 @@ class PulsatingEllipsoid:
             times, places, surface.faces, surface.region, rates=rates, period=beats * self.period
         )
 
-    def start(self, name: str, across: int = 16) -> Simulation:
-        """Blood at rest at t = 0 in free-slip walls, ``across`` spacings wide, with the preset called ``name``."""
+    def start(self, scheme: str | Scheme, across: int = 16, backend: str = "auto") -> Simulation:
+        """Blood at rest at t = 0 in free-slip walls, ``across`` spacings wide; ``scheme`` or a preset of that name."""
         spacing = 2 * self.radius / across
         scene = Scene(
             spacing=spacing, fluid=Fluid(), walls=self.motion(spacing / 2), valves=(Valve(OPENING, ((-1.0, 1e9),)),)
         )
-        return Simulator(scene, preset(name, wall=CompleteKernelWall(no_slip=False))).start(0.0)
+        scheme = preset(scheme) if isinstance(scheme, str) else scheme
+        return Simulator(scene, replace(scheme, wall=CompleteKernelWall(no_slip=False)), backend=backend).start(0.0)
 
     def core_errors(self, run: Simulation) -> tuple[float, float]:
         """Mean squares (m^2/s^2) of the particles' error and of the potential flow, 2 spacings inside the surface."""

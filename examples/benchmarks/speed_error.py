@@ -8,6 +8,8 @@ wall seconds are those of the steps alone, for the ventricle of the whole foreca
 - plane: Taylor-Green at Re 100 after one decay time, relative L2 error of the velocity.
 - space: Taylor-Green at Re 100, largest deviation of the kinetic energy at t = 1 ... 5 from a pseudo-spectral solution.
 - channel: plane Poiseuille flow started from rest, RMS error over the largest velocity at t = 0.5.
+- pipe: steady flow in a round pipe from its exact profile on, relative L2 error of the velocity after 0.2 s.
+- ellipsoid: the core of an ejecting ellipsoid at three phases, relative L2 error against its potential flow.
 - ventricle: NRMSE of forecasts 20 ms ahead on the sample recording that comes with torchsph.
 
 --quick takes coarse resolutions and, in the plane and in space, a fifth of the time: under a minute.
@@ -33,11 +35,13 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 import torch
+from walls import steady_pipe
 
 import geometry
 from torchsph import PotentialWall, Scene, Simulator, WeaklyCompressible, preset, skill, validation
 from torchsph.data import sample_truth
 from torchsph.presets import Scheme
+from torchsph.validation_ellipsoid import PulsatingEllipsoid
 from torchsph.validation_runs import channel, channel_error, kinetic_energy, taylor_green, taylor_green_error
 
 DECAY_TIME = 100 / (8 * math.pi**2)
@@ -112,6 +116,33 @@ def poiseuille(resolution: float, scheme: Scheme, backend: str, _: bool) -> tupl
     return *timed(action), run.particles.count * int(run.record.steps)
 
 
+def pipe(resolution: float, scheme: Scheme, backend: str, quick: bool) -> tuple[float, float, float, float]:
+    """Steady flow in a round pipe."""
+    run, error = steady_pipe(scheme, int(resolution), 10, backend)
+
+    def action() -> float:
+        run.advance(0.05 if quick else 0.2)
+        return error()
+
+    return *timed(action), run.particles.count * int(run.record.steps)
+
+
+def ellipsoid(resolution: float, scheme: Scheme, backend: str, quick: bool) -> tuple[float, float, float, float]:
+    """Core of an ejecting ellipsoid."""
+    body = PulsatingEllipsoid()
+    run = body.start(scheme, int(resolution), backend)
+
+    def action() -> float:
+        wrong, flow = 0.0, 0.0
+        for part in (0.1,) if quick else (0.1, 0.2, 0.3):
+            run.advance(part * body.period)
+            error, exact = body.core_errors(run)
+            wrong, flow = wrong + error, flow + exact
+        return math.sqrt(wrong / flow)
+
+    return *timed(action), run.particles.count * int(run.record.steps)
+
+
 def ventricle(resolution: float, scheme: Scheme, backend: str, quick: bool) -> tuple[float, float, float, float]:
     """Forecasts of the sample recording 20 ms ahead; ``resolution`` is the spacing in mm."""
     recording = geometry.read_recording(str(sample_truth()))
@@ -150,6 +181,13 @@ FLOWS = {
         "h = 1.3": {"smoothing_ratio": 1.3}, "position Verlet": {"order": "verlet"},
         "potential wall": {"wall": PotentialWall()},
     } | REFERENCE, "RMS error / largest velocity"),
+    "pipe": Flow(
+        pipe, WeaklyCompressible(sound_speed=10.0, artificial_viscosity=None), (10, 16, 20), (10,),
+        {"sound speed 10": {}}, "relative L2 velocity error",
+    ),
+    "ellipsoid": Flow(
+        ellipsoid, preset("weakly_compressible"), (12, 16, 20), (10,), {}, "relative L2 error of the core",
+    ),
     "ventricle": Flow(ventricle, preset("weakly_compressible"), (2.0, 1.5, 1.2), (2.5,), {
         "sound speed 3.5": {"sound_speed": 3.5}, "sound speed 10": {"sound_speed": 10.0},
         "Wendland C4, h = 1.6": {"kernel": "wendland_c4", "smoothing_ratio": 1.6}, "h = 1.6": {"smoothing_ratio": 1.6},

@@ -35,6 +35,7 @@ import json
 import os
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from unittest import mock
 
@@ -54,7 +55,9 @@ from torchsph import (
     validation_walls,
     wall_closest,
 )
+from torchsph.presets import Scheme
 from torchsph.scene import Fluid
+from torchsph.simulation import Simulation
 from torchsph.smoothing import kernel
 from torchsph.validation_ellipsoid import PulsatingEllipsoid
 from torchsph.wallfield import WallFields
@@ -67,8 +70,10 @@ RADIUS, VISCOSITY = 0.5, 0.1
 FORCE = 4 * VISCOSITY / RADIUS**2  # 1 m/s on the axis
 
 
-def pipe(wall: object, duration: float, across: int = 16, length: int = 10) -> dict[str, float]:
-    """Velocity error of steady pipe flow."""
+def steady_pipe(
+    scheme: Scheme, across: int, length: int, backend: str = "auto"
+) -> tuple[Simulation, Callable[[], float]]:
+    """Pipe flow that starts from its steady profile, and the relative L2 error of its velocity."""
     spacing = 1 / across
     tube = geometry.tube(RADIUS, (length + 14) * spacing, 0.5 * spacing)
     tube = tube.moved(tube.vertices - np.array([0, 0, 7 * spacing]))
@@ -76,20 +81,30 @@ def pipe(wall: object, duration: float, across: int = 16, length: int = 10) -> d
         spacing=spacing, fluid=Fluid(1.0, VISCOSITY), walls=geometry.WallMotion.at_rest(tube),
         period=(None, None, length * spacing), gravity=(0.0, 0.0, FORCE),
     )  # fmt: skip
-    scheme = WeaklyCompressible(sound_speed=10.0, artificial_viscosity=None, wall=wall)
-    run = Simulator(scene, scheme).start(0.0)
+    run = Simulator(scene, scheme, backend=backend).start(0.0)
 
     def exact() -> torch.Tensor:
         radius = run.particles.position[:, :2].double().norm(dim=1) * spacing
         return validation_walls.pipe_flow(radius, VISCOSITY, FORCE, RADIUS)
 
+    def error() -> float:
+        wrong = run.particles.velocity.double()
+        wrong[:, 2] -= exact()
+        return float(wrong.norm() / exact().norm())
+
     velocity = torch.zeros_like(run.particles.velocity)
     velocity[:, 2] = exact().float()
     run.particles = run.particles.changed(velocity=velocity)
+    return run, error
+
+
+def pipe(wall: object, duration: float, across: int = 16, length: int = 10) -> dict[str, float]:
+    """Velocity error of steady pipe flow."""
+    run, error = steady_pipe(
+        WeaklyCompressible(sound_speed=10.0, artificial_viscosity=None, wall=wall), across, length
+    )
     run.advance(duration)
-    wrong = run.particles.velocity.double()
-    wrong[:, 2] -= exact()
-    return {"velocity": float(wrong.norm() / exact().norm()), "outside": int(run.record.outside)}
+    return {"velocity": error(), "outside": int(run.record.outside)}
 
 
 def container(name: str, spacing: float) -> geometry.Surface:
