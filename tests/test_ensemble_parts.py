@@ -77,14 +77,15 @@ def test_a_useless_increment_is_ignored_and_a_checkpoint_goes_on():
 
 def test_the_spread_becomes_that_of_the_errors():
     """Errors of deviation 0.4 under noise of 0.8, members that start at 0.1; the estimator halves what it sees."""
-    draw, match = torch.Generator().manual_seed(0), SpreadMatch(memory=5.0, smallest=0.1, largest=10.0)
-    best = 0.4**2 / (0.4**2 + 0.8**2) / 0.5
+    draw, match = torch.Generator().manual_seed(0), SpreadMatch()
+    size, best = 0.1, 0.4**2 / (0.4**2 + 0.8**2) / 0.5
     for _ in range(80):
         error, noise, anomaly = torch.randn(3, 3000, generator=draw, dtype=torch.float64)
-        anomaly = 0.1 * match.factor * anomaly
+        size *= match.factor  # members carry it on
+        anomaly = size * anomaly
         found = 0.5 * (0.4 * error + 0.8 * noise)
         match.learn(float(best * (found * found).sum()), float((0.5 * anomaly * anomaly).sum()))
-    assert 0.1 * match.factor == pytest.approx(0.4, rel=0.1)
+    assert size == pytest.approx(0.4, rel=0.1)
     again = SpreadMatch()
     again.restore(match.state())
     assert again.factor == match.factor
