@@ -6,6 +6,9 @@ import math
 
 from .errors import AssimilationError
 
+# one cycle's ratio is noisy, and the factor acts on anomalies that carry the factors of the cycles before
+_MOST = 4.0
+
 
 class SpreadMatch:
     """One factor on the forecast's anomalies that gives them the variance that the forecast's errors show.
@@ -35,7 +38,7 @@ class SpreadMatch:
     def learn(self, shown: float, own: float) -> None:
         """From one cycle: the number of the innovations, and that of the ensemble with the factor applied."""
         if own > 0:
-            ratio = min(max(shown / own, 1.0 / 16.0), 16.0)
+            ratio = min(max(shown / own, 1.0 / _MOST), _MOST)
             self._cycles += 1
             self.factor *= math.exp(0.5 * math.log(ratio) / min(self.memory, 1.0 + self._cycles))
             self.factor = min(max(self.factor, self.smallest), self.largest)
