@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -82,7 +84,8 @@ class FrameSmoother:
         ``beam`` (n, D): directions along which alone the samples know it; noise and smoothness are then those of
         ``choice``, or the smoother's own. ``choice``: taken over from an earlier increment; None chooses from this one.
         """
-        smoother = self.smoother
+        # a forecast's errors reach as far as those that samples share: the ones would be taken for the others
+        smoother = replace(self.smoother, correlated=False)
         if beam is not None:
             known = {} if choice is None else {"curvature": choice.curvature, "no_slip": choice.no_slip}
             smoother, choice = smoother.fixed(**known), None
