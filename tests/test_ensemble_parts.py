@@ -167,8 +167,9 @@ def test_draws_have_the_deviation_that_the_posterior_states(measured):
     mask = torch.from_numpy(np.array(measured.mask[0], bool))
     draws = splines.draws(fitted, 0, 40, torch.Generator().manual_seed(0))[:, :, mask]
     stated = fitted.std(splines.nodes[mask.flatten()]).T.double()
-    # the mean over thousands of nodes of 40 draws' variance; neighbours share their errors
-    assert float(draws.square().mean().sqrt()) == pytest.approx(float(stated.square().mean().sqrt()), rel=0.1)
+    np.testing.assert_allclose(draws.square().mean((0, 2)).sqrt(), stated.square().mean(1).sqrt(), rtol=1e-6)
+    # larger where the posterior is wider: at 40 draws the deviation of each node is known to a ninth
+    assert np.corrcoef(draws.std(0).flatten(), stated.flatten())[0, 1] > 0.7
     assert float(draws.mean(0).square().mean().sqrt()) < 2 * float(stated.square().mean().sqrt()) / 40**0.5
 
 

@@ -120,7 +120,10 @@ class FrameSmoother:
     def draws(
         self, fitted: regularize.SplineField, frame: int, count: int, generator: torch.Generator
     ) -> Tensor:
-        """(count, D, *shape) deviations from a fit of ``uncertainty=True``, drawn from its posterior; 0 outside."""
+        """(count, D, *shape) deviations from a fit of ``uncertainty=True``, drawn from its posterior; 0 outside.
+
+        Their RMS over the mask is that of the stated deviation, component by component.
+        """
         recording = self.recording
         mask = torch.from_numpy(np.array(recording.mask[frame], bool).reshape(-1))
         out = torch.zeros((count, recording.dimension, recording.grid.size), dtype=torch.float64)
@@ -131,6 +134,10 @@ class FrameSmoother:
             one[:, mask] = regularize.SplineField(fitted.knots, coefficients, fitted.covered)(
                 self.nodes[mask], outside=0.0
             ).T
+        # the factor knows independent errors alone; those that neighbours share make the stated deviation larger
+        stated = fitted.std(self.nodes[mask]).double().square().mean(0).sqrt()
+        own = out[:, :, mask].square().mean((0, 2)).sqrt().clamp_min(1e-300)
+        out *= (stated / own)[:, None]
         return out.reshape(count, recording.dimension, *recording.grid.shape)
 
     def _beam(self, frame: int, used: Tensor) -> Tensor | None:
