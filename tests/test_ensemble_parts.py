@@ -77,14 +77,15 @@ def test_a_useless_increment_is_ignored_and_a_checkpoint_goes_on():
 
 def test_the_spread_becomes_that_of_the_errors():
     """Errors of deviation 0.4 under noise of 0.8, members that start at 0.1; the estimator halves what it sees."""
-    draw, match = torch.Generator().manual_seed(0), SpreadMatch(memory=5.0, smallest=0.1, largest=10.0)
-    best = 0.4**2 / (0.4**2 + 0.8**2) / 0.5
+    draw, match = torch.Generator().manual_seed(0), SpreadMatch()
+    size, best = 0.1, 0.4**2 / (0.4**2 + 0.8**2) / 0.5
     for _ in range(80):
         error, noise, anomaly = torch.randn(3, 3000, generator=draw, dtype=torch.float64)
-        anomaly = 0.1 * match.factor * anomaly
+        size *= match.factor  # members carry it on
+        anomaly = size * anomaly
         found = 0.5 * (0.4 * error + 0.8 * noise)
         match.learn(float(best * (found * found).sum()), float((0.5 * anomaly * anomaly).sum()))
-    assert 0.1 * match.factor == pytest.approx(0.4, rel=0.1)
+    assert size == pytest.approx(0.4, rel=0.1)
     again = SpreadMatch()
     again.restore(match.state())
     assert again.factor == match.factor
@@ -166,8 +167,9 @@ def test_draws_have_the_deviation_that_the_posterior_states(measured):
     mask = torch.from_numpy(np.array(measured.mask[0], bool))
     draws = splines.draws(fitted, 0, 40, torch.Generator().manual_seed(0))[:, :, mask]
     stated = fitted.std(splines.nodes[mask.flatten()]).T.double()
-    # the mean over thousands of nodes of 40 draws' variance; neighbours share their errors
-    assert float(draws.square().mean().sqrt()) == pytest.approx(float(stated.square().mean().sqrt()), rel=0.1)
+    np.testing.assert_allclose(draws.square().mean((0, 2)).sqrt(), stated.square().mean(1).sqrt(), rtol=1e-6)
+    # larger where the posterior is wider: at 40 draws the deviation of each node is known to a ninth
+    assert np.corrcoef(draws.std(0).flatten(), stated.flatten())[0, 1] > 0.7
     assert float(draws.mean(0).square().mean().sqrt()) < 2 * float(stated.square().mean().sqrt()) / 40**0.5
 
 

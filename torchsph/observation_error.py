@@ -104,8 +104,9 @@ def estimate_error(
         surprise *= np.stack([_local_level(distance[f], used[f]) for f in range(measured.frames)])
     left = float(np.median(robust))
     stated = float(np.median(measured.sigma[np.repeat(used[:, None], measured.dimension, 1)])) if told else math.inf
-    # residuals that are next to nothing, or far above the noise that the file states, are the spline's, not noise
-    noisy = _LITTLE * speed < left < _ABOVE * stated
+    # residuals that are next to nothing, or far above the noise that the file states, are the spline's, not noise; so
+    # is much of what one component's spline leaves, which the file's own deviation makes needless
+    noisy = _LITTLE * speed < left < _ABOVE * stated and not (told and measured.beam is not None)
     kernel = kernel_width(residual, used, measured.grid.spacing) if noisy else 0.0
     redundancy = np.full(measured.frames, _nodes_of(kernel, measured.grid.spacing))
     for frame in range(measured.frames):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -82,7 +84,8 @@ class FrameSmoother:
         ``beam`` (n, D): directions along which alone the samples know it; noise and smoothness are then those of
         ``choice``, or the smoother's own. ``choice``: taken over from an earlier increment; None chooses from this one.
         """
-        smoother = self.smoother
+        # a forecast's errors reach as far as those that samples share: the ones would be taken for the others
+        smoother = replace(self.smoother, correlated=False)
         if beam is not None:
             known = {} if choice is None else {"curvature": choice.curvature, "no_slip": choice.no_slip}
             smoother, choice = smoother.fixed(**known), None
@@ -117,7 +120,10 @@ class FrameSmoother:
     def draws(
         self, fitted: regularize.SplineField, frame: int, count: int, generator: torch.Generator
     ) -> Tensor:
-        """(count, D, *shape) deviations from a fit of ``uncertainty=True``, drawn from its posterior; 0 outside."""
+        """(count, D, *shape) deviations from a fit of ``uncertainty=True``, drawn from its posterior; 0 outside.
+
+        Their RMS over the mask is that of the stated deviation, component by component.
+        """
         recording = self.recording
         mask = torch.from_numpy(np.array(recording.mask[frame], bool).reshape(-1))
         out = torch.zeros((count, recording.dimension, recording.grid.size), dtype=torch.float64)
@@ -128,6 +134,10 @@ class FrameSmoother:
             one[:, mask] = regularize.SplineField(fitted.knots, coefficients, fitted.covered)(
                 self.nodes[mask], outside=0.0
             ).T
+        # the factor knows independent errors alone; those that neighbours share make the stated deviation larger
+        stated = fitted.std(self.nodes[mask]).double().square().mean(0).sqrt()
+        own = out[:, :, mask].square().mean((0, 2)).sqrt().clamp_min(1e-300)
+        out *= (stated / own)[:, None]
         return out.reshape(count, recording.dimension, *recording.grid.shape)
 
     def _beam(self, frame: int, used: Tensor) -> Tensor | None:

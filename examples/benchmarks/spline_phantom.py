@@ -120,8 +120,8 @@ def scores(field: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> dict:
 def calibration(truth: geometry.Recording, measured: geometry.Recording, frames: list[int]) -> dict:
     """Root mean square of (fit - truth) / std per component over the mask of some frames.
 
-    With the samples' errors taken for independent, with what neighbours share, and with the tracker's resolution cell
-    (as wide as the Gaussian above) told besides; "of the blurred truth": of what a tracker of that cell can see at all.
+    As it comes, and with the tracker's resolution cell (as wide as the Gaussian above) told besides; "of the blurred
+    truth": of what a tracker of that cell can see at all.
     """
     splines, total = FrameSmoother(measured, regularize.Smoother.preset("default")), []
     for frame in frames:
@@ -130,9 +130,8 @@ def calibration(truth: geometry.Recording, measured: geometry.Recording, frames:
         blurred = gaussian(truth.velocity[frame], mask.astype(float), measured.grid.spacing)
         off = [fitted(points).numpy() - each[:, mask].T for each in (truth.velocity[frame], blurred)]
         std, wide = fitted.std(points).numpy(), fitted.std(points, blur=WIDTH).numpy()
-        one = fitted.posterior.inflation.numpy()
-        total.append([np.square(z).mean(0) for z in (off[0] / std * one, off[0] / std, off[0] / wide, off[1] / std)])
-    names = ("z_independent", "z", "z_with_blur", "z_of_the_blurred_truth")
+        total.append([np.square(z).mean(0) for z in (off[0] / std, off[0] / wide, off[1] / std)])
+    names = ("z", "z_with_blur", "z_of_the_blurred_truth")
     return dict(zip(names, np.sqrt(np.mean(total, axis=0)).tolist(), strict=True))
 
 
