@@ -7,7 +7,7 @@ import pytest
 import torch
 
 import geometry
-from torchsph import NumericalFailure, Projection, Scene, Simulator
+from torchsph import NumericalFailure, Projection, Scene, Simulator, WeaklyCompressible
 from torchsph.pairs.interface import RateTerms
 from torchsph.particles import Particles
 from torchsph.projection import Neighbourhood
@@ -234,6 +234,17 @@ def test_a_member_with_nan_is_frozen_and_the_others_go_on():
     alone = Simulator(PERIODIC, SCHEME, dtype=torch.float64).resume(lost, 0.0)
     with pytest.raises(NumericalFailure, match="all 1 members have failed"):
         alone.advance(0.02)
+
+
+@pytest.mark.parametrize("scheme", [SCHEME, WeaklyCompressible()])
+def test_a_member_that_is_too_fast_for_any_step_is_frozen(scheme):
+    """1e30 m/s would take a step of next to nothing, for ever."""
+    both = particles(vortex, members=2, dtype=torch.float32)
+    wild = both.velocity.clone()
+    wild[7] = 1e30
+    run = Simulator(PERIODIC, scheme).resume(both.changed(velocity=wild), 0.0)
+    run.advance(0.01)
+    assert run.record.failed.tolist() == [True, False]
 
 
 def test_a_free_surface_has_to_be_named():

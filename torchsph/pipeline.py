@@ -47,6 +47,11 @@ def make_model(
     return Simulator(Scene.from_recording(recording, spacing), scheme_preset(preset), device=device)
 
 
+def make_smoother(preset: str) -> regularize.Smoother:
+    """The splines that go with a simulator's preset: the thesis's with the thesis's, else the default ones."""
+    return regularize.Smoother.preset("thesis" if preset == "thesis" else "default")
+
+
 def run_methods(
     measured: geometry.Recording, methods: Sequence[str], *, preset: str = "default", spacing: float | None = None,
     members: int | None = None, also: Sequence[geometry.Recording] = (), truth: geometry.Recording | None = None,
@@ -74,7 +79,7 @@ def run_methods(
         methods = [name for name in methods if name == "ensemble"]
     if not methods:
         return {}
-    smoother = regularize.Smoother.preset(preset)
+    smoother = make_smoother(preset)
     timer = _Timer()
     splines = FrameSmoother(measured, smoother)
     smoothed = smooth_frames(splines, progress)

@@ -35,6 +35,8 @@ if TYPE_CHECKING:
 _SEARCH_MARGIN = 0.25
 # from so many particles on they are sorted in space, every so many searches: smaller sets fit into the caches anyway
 _SORT_FROM, _SORT_EVERY = 50_000, 8
+# a member that would need more steps than this for the rest of an interval has broken down
+_MOST_STEPS = 1e7
 # support radius of the fetching weight, in spacings
 FETCH_RADIUS = 2.0
 
@@ -158,6 +160,10 @@ class Simulation:
                 self.particles, self._acceleration, self._stepper.coefficients, left, longest,
                 None if checkpoints is None else checkpoints.factor,
             )
+            hopeless = (left > 0) & (step * _MOST_STEPS < left)
+            if bool(hopeless.any()):
+                self._fail(hopeless)
+                continue
             self.domain.at(self.time + done * self.units.time)
             self._pass_valves()
             if self._population is not None:
@@ -272,7 +278,8 @@ class Simulation:
         self.record.failed |= broken
         if bool(self.record.failed.all()):
             raise NumericalFailure(
-                f"all {self.members} members have failed (not finite, or beyond the density that a rollback allows) "
+                f"all {self.members} members have failed (not finite, too fast for any step, or beyond the density "
+                "that a rollback allows) "
                 f"after {self.record.steps.tolist()} steps at about {self.time:.6g} s; lower the Courant fraction, "
                 "raise the sound speed, or check the imposed velocity (largest Mach number "
                 f"{float(self.record.largest_mach.max()):.2f})"
