@@ -125,12 +125,13 @@ def after_steps(scheme, options, dimension, what, centre, every):
 
 @pytest.mark.parametrize(
     ("scheme", "options", "dimension"),
-    [("weakly_compressible", {"sound_speed": 10.0, "shifting": None}, 2), ("projection", {}, 2), ("projection", {}, 3)],
+    [("weakly_compressible", {"sound_speed": 10.0, "shifting": None}, 2), ("projection", {"shifting": None}, 2),
+     ("projection", {"shifting": None}, 3)],
 )
 def test_a_hole_closes_and_a_crowd_thins_while_the_flow_goes_on(scheme, options, dimension):
     """Within forty steps, over the seams of the box too; without the control both are still there.
 
-    Shifting, where it is strong, closes such a hole as well: it is off in the weakly compressible case.
+    Shifting, where it is strong, closes such a hole as well: it is off.
     """
     side, gaps, crowds = SIDE[dimension], [], []
     for every in (5, 10_000):

@@ -266,7 +266,7 @@ def test_a_hundred_whole_particles_in_the_place_of_one_are_reported():
 
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_a_ventricle_of_three_centimetres_in_float32_follows_float64(backend):
-    """SI lengths of 0.03 m and speeds of 2 m/s through an open valve for 10 ms: the same field within 1e-4."""
+    """SI lengths of 0.03 m and blood entering at 0.6 m/s for 10 ms: the same field within 1e-4."""
     recording = geometry.Ventricle().recording(np.arange(0.28, 0.321, 0.01), grid_spacing=2.5e-3, wall_spacing=2e-3)
     scene = Scene.from_recording(recording, 2.5e-3)
     scheme = WeaklyCompressible()
@@ -282,7 +282,7 @@ def test_a_ventricle_of_three_centimetres_in_float32_follows_float64(backend):
         fields.append(run.fetch(recording.grid, mask).value.double())
     single, double = fields
     assert float((single - double).norm()) < 1e-4 * float(double.norm())
-    assert float(double.abs().max()) > 1.0
+    assert 0.4 < float(double.abs().max()) < 1.2  # it jets in at about the mean speed that the volume asks for
 
 
 @pytest.mark.slow

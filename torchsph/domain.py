@@ -271,10 +271,22 @@ class Domain:
         towards = ((velocity - wall.velocity[near]) * normal).sum(1).clamp_max(0.0)
         done = -(after.mass[near] * towards * (normal * wall.velocity[near]).sum(1)).double() * self._energy
         record.wall_work.index_add_(0, after.member[near], done.nan_to_num(0.0, 0.0, 0.0))
-        return after.changed(
-            position=after.position.index_add(0, near, (gap - distance)[:, None] * normal),
-            velocity=after.velocity.index_add(0, near, -towards[:, None] * normal),
-        )
+        position = after.position.index_add(0, near, (gap - distance)[:, None] * normal)
+        velocity = after.velocity.index_add(0, near, -towards[:, None] * normal)
+        crossed = near[distance < 0]
+        if crossed.numel():
+            position = self._pushed_back(after.changed(position=position), crossed, gap)
+        return after.changed(position=position, velocity=velocity)
+
+    def _pushed_back(self, particles: Particles, row: Tensor, gap: float) -> Tensor:
+        """Positions (N, D) with those of ``row`` (n,) that are still beyond a wall put before it.
+
+        At an edge what one wall pushes back may end behind the other, and a step may lead past where a distance
+        carried on to first order holds: so these few look again.
+        """
+        wall = self.sample(particles.select(row))
+        way = torch.where(wall.distance < 0, gap - wall.distance, torch.zeros_like(wall.distance))
+        return particles.position.index_add(0, row, way[:, None] * wall.normal)
 
     def _wrapped(self, particles: Particles) -> Particles:
         return particles if self.period is None else particles.changed(
