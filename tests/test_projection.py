@@ -8,9 +8,9 @@ import torch
 
 import geometry
 from torchsph import NumericalFailure, Projection, Scene, Simulator, WeaklyCompressible
+from torchsph.neighbourhood import Neighbourhood
 from torchsph.pairs.interface import RateTerms
 from torchsph.particles import Particles
-from torchsph.projection import Neighbourhood
 from torchsph.scene import Fluid
 from torchsph.terms import LIMITS
 

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from .openings import Frame
 from .pairs.interface import Backend
 from .particles import RESERVOIR, Particles
-from .reservoirs import Frame
 from .scene import Valve
 from .transfer import fetch_at
 

@@ -17,8 +17,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from geometry import OrificePlane, orifices
+from geometry import orifices
 
+from .openings import Frame
 from .pairs.interface import per_particle
 from .particles import CHANNEL, FLUID, RESERVOIR, Particles
 from .record import Record
@@ -373,46 +374,3 @@ class Reservoirs:
             mine = (particles.kind == RESERVOIR + number) | (particles.kind == CHANNEL - number)
             points = torch.where(mine[:, None], points + inward, points)
         return points
-
-
-class Frame:
-    """An opening in internal units on the device."""
-
-    def __init__(
-        self, plane: OrificePlane, velocity: np.ndarray, length: float, dtype: torch.dtype, device: str,
-    ) -> None:
-        def tensor(value: np.ndarray) -> Tensor:
-            return torch.as_tensor(np.ascontiguousarray(value), dtype=dtype, device=device)
-
-        self._plane = OrificePlane(
-            plane.centroid / length, plane.normal, plane.area / length ** len(plane.basis), plane.basis,
-            plane.rim / length, plane.edges,
-        )
-        self.centre, self.normal, self.basis = tensor(self._plane.centroid), tensor(plane.normal), tensor(plane.basis)
-        self.area = float(self._plane.area)
-        self.velocity = tensor(velocity)
-        self.radius = float(np.linalg.norm(self._plane.outline, axis=1).max())
-
-    def height(self, position: Tensor) -> Tensor:
-        """Outward distance from the plane, (n,)."""
-        return (position - self.centre) @ self.normal
-
-    def inset(self, position: Tensor) -> Tensor:
-        """In-plane distance from the rim, (n,), positive over the opening."""
-        return self._plane.lateral_distance(position)
-
-    def behind(self, position: Tensor) -> Tensor:
-        """(n,) bool: points (n, D) less than half a spacing before the opening, or in the channel behind it."""
-        height = self.height(position)
-        aside = (position - self.centre - height[:, None] * self.normal).norm(dim=1)
-        return (height > -0.5) & (aside < self.radius + 1.0)
-
-    def lattice(self, length: float) -> Tensor:
-        """Unit lattice in the channel of the given length behind the opening, (n, D)."""
-        reach = int(np.ceil(self.radius)) + 1
-        axis = torch.arange(-reach, reach, dtype=self.centre.dtype, device=self.centre.device) + 0.5
-        flat = torch.cartesian_prod(*[axis] * self.basis.shape[0]).reshape(-1, self.basis.shape[0])
-        place = self.centre + flat @ self.basis
-        place = place[self.inset(place) > 0]
-        layers = torch.arange(int(length), dtype=place.dtype, device=place.device) + 0.5
-        return (place[:, None, :] + layers[None, :, None] * self.normal).reshape(-1, self.centre.shape[0])

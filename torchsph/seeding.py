@@ -11,11 +11,11 @@ from torch import Tensor
 
 from geometry import WallMotion
 
+from .neighbourhood import Neighbourhood, packing
 from .neighbours import PairSearch
 from .pairs import backend as choose_backend
 from .pairs.interface import PairState, RateTerms, Support
 from .particles import FLUID, Particles
-from .projection import Neighbourhood, packing
 from .schemes import CompleteKernelWall, PotentialWall
 from .smoothing import kernel
 from .walls import potential

@@ -14,13 +14,14 @@ from geometry import Grid
 
 from .incompressible import Projection
 from .integrate import Stepper
+from .neighbourhood import Neighbourhood, divergence_free
 from .neighbours import PairSearch
 from .pairs import backend as choose_backend
 from .parameters import Coefficients, Parameters
 from .particles import Particles
 from .population import Population
 from .pressure_valves import PressureValves
-from .projection import Neighbourhood, ProjectionStepper, check_filled, divergence_free
+from .projection import ProjectionStepper, check_filled
 from .record import Record
 from .rollback import Checkpoints
 from .schemes import CompleteKernelWall
