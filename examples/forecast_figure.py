@@ -25,7 +25,7 @@ import matplotlib.pyplot as plt
 from scipy.signal import find_peaks
 
 import geometry
-from torchsph import GridForecast, Scene, Simulator, Transfer
+from torchsph import GridForecast, Scene, Simulator, Transfer, preset
 
 
 def phases(recording: geometry.Recording, lead: float) -> dict[str, int]:
@@ -82,7 +82,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("forecast.png"))
     options = parser.parse_args()
     recording = geometry.read_recording(options.recording)
-    model = Simulator(Scene.from_recording(recording, options.spacing))
+    model = Simulator(Scene.from_recording(recording, options.spacing), preset("default"))
     chosen, row = phases(recording, options.lead), plane_rows(recording)
     figure, axes = plt.subplots(4, len(chosen), figsize=(2.6 * len(chosen), 13), squeeze=False, layout="constrained")
     for column, (name, frame) in enumerate(sorted(chosen.items(), key=lambda item: item[1])):
