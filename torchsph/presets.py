@@ -14,8 +14,8 @@ Scheme = WeaklyCompressible | Projection
 _THESIS_RATIO = 16 ** (1 / 3) / 3
 
 # Incompressible steps, for flow that fills a heart's chamber. Error over persistence's on a ventricle at 1 mm, 5 / 10 /
-# 20 / 40 ms ahead: .57 / .48 / .40 / .34 with steps of up to 0.7 ms; .57 / .48 / .39 / .34 with 0.5 ms at 1.25 times
-# the cost; .58 / .50 / .41 / .35 with 1 ms at 0.8 times; weakly compressible .57 / .47 / .40 / .34 at 2.2 times.
+# 20 / 40 ms ahead: .57 / .48 / .40 / .34 with steps of up to 0.7 ms; .57 / .48 / .39 / .34 with 0.5 ms at 1.2 times
+# the cost; .58 / .50 / .41 / .35 with 1 ms at 0.8; weakly compressible .57 / .47 / .40 / .34 at twice the cost.
 _PROJECTION = Projection(max_step=7e-4, courant=0.4, tolerance=1.5e-2)
 
 PRESETS: dict[str, Scheme] = {
