@@ -8,6 +8,7 @@ from tqdm import tqdm
 
 import geometry
 
+from .forecast import GridForecast, Transfer
 from .simulator import Simulator
 
 
@@ -20,18 +21,14 @@ def run_freely(
     the recording's times.
     """
     time, grid = measured.time, measured.grid
-    run = model.start(float(time[0]), seed=seed)
-    run.impose(grid, torch.from_numpy(np.asarray(start, np.float32)).to(model.device)[None],
-               torch.from_numpy(np.array(measured.mask[0], bool)).to(model.device))
-    if run.can_project:
-        run.project(2)
+    masks = [torch.from_numpy(np.array(mask, bool)).to(model.device) for mask in measured.mask]
+    velocity = torch.from_numpy(np.asarray(start, np.float32)).to(model.device)
+    going = GridForecast(model, grid, velocity, masks[0], float(time[0]), Transfer(fade=None), seed=seed)
     fields, missing = [], []
     for frame in tqdm(range(measured.frames), desc="free", unit="frame", disable=None if progress else True):
-        mask = torch.from_numpy(np.array(measured.mask[frame], bool)).to(model.device)
-        run.advance(float(time[frame]))
-        found = run.fetch(grid, mask)
-        fields.append(found.value[0].cpu().numpy())
-        missing.append(int((mask & ~found.covered[0]).sum()))
+        value, covered = going.at(float(time[frame]), masks[frame])
+        fields.append(value[0].cpu().numpy())
+        missing.append(int((masks[frame] & ~covered[0]).sum()))
     return measured.with_velocity(
         np.stack(fields), uncovered=np.array(missing, np.int64), description="one SPH simulation without data"
     )

@@ -91,8 +91,8 @@ class ProjectionStepper:
         middle = around.later(middle, 0.5 * step)
         wall, before = around.sample(middle), middle.velocity
         here = Neighbourhood(middle, self.pair_search, self.pair_search.at(middle), self.support, wall)
-        weight = self._weight(middle, around)
-        sums, force = self._sums(here, around, weight)
+        weight, force = self._split(around.body_force(middle))
+        sums, force = self._sums(here, force)
         if force is not None:
             pushed = torch.where(middle.fluid[:, None], middle.velocity + dt[:, None] * force, middle.velocity)
             middle = middle.changed(velocity=pushed)
@@ -141,34 +141,31 @@ class ProjectionStepper:
         drawn = particles.inside & drawn.index_select(0, particles.member)
         return torch.where(drawn, around.shortfall(particles), torch.zeros_like(particles.mass))
 
-    def _weight(self, particles: Particles, around: Surroundings) -> Tensor | None:
-        """The part (N, D) of a body force that only adds its potential to the pressure, or None.
+    def _split(self, force: Tensor | None) -> tuple[Tensor | None, Tensor | None]:
+        """A body force (N, D) as the part that only adds its potential to the pressure, and the rest; None for nothing.
 
         Without a free surface or a given pressure a uniform force moves nothing along an axis that is not periodic. The
         pressure that bears it would be large, and its differences on disordered particles stir the fluid; so it is left
         out of the equation and added afterwards, exactly.
         """
-        bound = self.scheme.surface is not None or self.held_kinds is not None
-        force = None if bound else around.body_force(particles)
-        if force is None or self.pair_search.period is None:
-            return force
-        return torch.where(torch.isinf(self.pair_search.period), force, torch.zeros_like(force))
+        if force is None or self.scheme.surface is not None or self.held_kinds is not None:
+            return None, force
+        if self.pair_search.period is None:
+            return force, None
+        weight = torch.where(torch.isinf(self.pair_search.period), force, torch.zeros_like(force))
+        return weight, force - weight
 
-    def _sums(
-        self, here: Neighbourhood, around: Surroundings, weight: Tensor | None
-    ) -> tuple[Rates, Tensor | None]:
-        """First-pass sums, and the acceleration (N, D) by friction and body forces but ``weight``, or None."""
-        particles, wall, total = here.particles, here.wall, around.body_force(here.particles)
-        if weight is not None:
-            total = total - weight if self.pair_search.period is not None else None
+    def _sums(self, here: Neighbourhood, force: Tensor | None) -> tuple[Rates, Tensor | None]:
+        """First-pass sums, and the acceleration (N, D) by friction and ``force``, or None without either."""
+        particles, wall = here.particles, here.wall
         if self._laminar is None:
-            return here.rates(self._terms), total
+            return here.rates(self._terms), force
         state = particles.state(particles.deviation)
         sums, drag = here.search.backend.right_hand_side(here.pairs, state, self.support, self._terms, self._laminar)
         if wall is not None:
             nu = self.coefficients.viscosity if self.scheme.wall.no_slip else None
             drag = complete_forces(drag, particles.velocity, wall, viscosity=nu, member=particles.member)
-        return sums, drag if total is None else total + drag
+        return sums, drag if force is None else force + drag
 
     @staticmethod
     def _guess(particles: Particles, weight: Tensor | None, dt: Tensor) -> Tensor | None:

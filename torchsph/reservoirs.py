@@ -205,7 +205,7 @@ class Reservoirs:
         mass = place.new_full((members.numel(),), frame.area * self.far / max(count, 1))
         new = Particles(
             position=place.repeat(copies, 1), velocity=place.new_zeros((count * copies, place.shape[1])),
-            deviation=self._mouth_deviation(particles, frame, members).repeat_interleave(count),
+            deviation=self._mouth_mean(particles, frame, particles.deviation)[members].repeat_interleave(count),
             mass=mass.repeat_interleave(count), member=members.repeat_interleave(count),
             kind=kind.repeat(copies),
             members=particles.members,
@@ -213,22 +213,12 @@ class Reservoirs:
         return new
 
     @staticmethod
-    def _mouth_deviation(particles: Particles, frame: Frame, members: Tensor) -> Tensor:
-        """Mean density deviation of the fluid near an orifice, per member: what a new buffer starts with."""
+    def _mouth_mean(particles: Particles, frame: Frame, values: Tensor) -> Tensor:
+        """Mean of ``values`` (N,) over the fluid near an orifice, (members,)."""
         near = (particles.position - frame.centre).norm(dim=1) < frame.radius
-        weight = (near & particles.fluid).to(particles.deviation.dtype)
-        total = particles.per_member(weight * particles.deviation, "sum")
-        return (total / particles.per_member(weight, "sum").clamp_min(1.0))[members]
-
-    @staticmethod
-    def _mouth_pressure(
-        particles: Particles, frame: Frame, pressure: Callable[[Particles], Tensor]
-    ) -> Callable[[Particles], Tensor]:
-        """Mean pressure of the fluid near an orifice, which buffers of the incompressible scheme have none of."""
-        near = particles.select(((particles.position - frame.centre).norm(dim=1) < frame.radius) & particles.fluid)
-        total = near.per_member(pressure(near), "sum")
-        mean = total / near.per_member(torch.ones_like(near.mass), "sum").clamp_min(1.0)
-        return lambda some: mean.index_select(0, some.member)
+        near &= particles.fluid
+        total = particles.per_member(torch.where(near, values, torch.zeros_like(values)), "sum")
+        return total / particles.per_member(near.to(values.dtype), "sum").clamp_min(1.0)
 
     def driven(self, particles: Particles, *, channel: bool = False) -> Particles:
         """Give the buffers' particles their velocity for the present time; with ``channel`` also the free channels'."""
@@ -334,12 +324,14 @@ class Reservoirs:
             ):
                 if not bool(which.any()):
                     continue
-                some, level = particles.select(which), pressure
+                some = particles.select(which)
+                level = pressure(some)
                 if which is entered and particles.pressure is not None and number not in self.given:
-                    level = self._mouth_pressure(particles, frame, pressure)
+                    # buffers of the incompressible scheme have none
+                    level = self._mouth_mean(particles, frame, pressure(particles)).index_select(0, some.member)
                 counter[:, valve] += some.per_member(torch.ones_like(some.member), "sum")
                 volume[:, valve] += some.per_member(some.mass.double(), "sum") * unit
-                energy[:, valve] += some.per_member(carried_energy(some, level(some)), "sum") * self._energy
+                energy[:, valve] += some.per_member(carried_energy(some, level), "sum") * self._energy
         particles = particles.changed(kind=kind)
         if not fresh and not bool(gone.any()):
             return particles, False

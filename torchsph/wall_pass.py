@@ -7,6 +7,7 @@ result once, which takes a fifth of the time of torch's passes over columns.
 from __future__ import annotations
 
 import ctypes
+from functools import lru_cache
 
 import torch
 from torch import Tensor
@@ -115,19 +116,25 @@ class _Code:
         self.sph_wall_near = library().function("wall_near", reals)
 
 
+@lru_cache
+def _code(dtype: torch.dtype) -> _Code | None:
+    """Looked up once, for every step asks several times; None: no such precision, or nothing was compiled."""
+    try:
+        return _Code(_REALS[dtype]) if dtype in _REALS else None
+    except LibraryMissing:
+        return None
+
+
 def _compiled(wall: WallSample | None, *tensors: Tensor | None) -> _Code | None:
     """Compiled passes for these arrays, or None: other device or type, no library, gradients wanted."""
-    if wall is None or wall.rows is None or wall.rows.device.type != "cpu" or wall.rows.dtype not in _REALS:
+    if wall is None or wall.rows is None or wall.rows.device.type != "cpu":
         return None
     given = [t for t in (wall.rows, *tensors) if t is not None]
     if any(t.dtype != wall.rows.dtype for t in given):
         return None
     if torch.is_grad_enabled() and any(t.requires_grad for t in given):
         return None
-    try:
-        return _Code(_REALS[wall.rows.dtype])
-    except LibraryMissing:
-        return None
+    return _code(wall.rows.dtype)
 
 
 def _arguments(wall: WallSample, vectors: Tensor, **arrays: int | float | None) -> ctypes._CArgObject:

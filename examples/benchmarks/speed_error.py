@@ -14,6 +14,9 @@ wall seconds are those of the steps alone, for the ventricle of the whole foreca
 
 --quick takes coarse resolutions and, in the plane and in space, a fifth of the time: under a minute.
 
+The results beside it are of older code: "default preset" there is the weakly compressible one, the projection had twice
+the cost, and there is no pipe and no ellipsoid yet.
+
 Measured (results/speed_error.json and .png): in the plane 1.1 % in 0.7 CPU seconds (40^2) and 0.6 % in 1.4 (60^2).
 There 0.7 of the speed of sound costs 0.7 and is no worse; a narrower kernel or twice the speed of sound is slower and
 worse, also in space. In space the incompressible scheme is as good as the options for periodic flows at a quarter of

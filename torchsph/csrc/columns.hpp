@@ -12,6 +12,7 @@
 #include <limits>
 #include <vector>
 
+#include "finite.hpp"
 #include "lanes.hpp"
 
 namespace sph {
@@ -20,19 +21,6 @@ constexpr double column_width = 1.0;            // in search radii, across the c
 constexpr double bin_width = 0.15;              // in search radii, along them
 constexpr std::int64_t bins_per_particle = 32;  // a larger table is made coarser
 constexpr int slack = 16;                    // reals that vector loads may read past the end
-
-template <class Real> SPH_INLINE bool finite(Real value) {
-  // on the bits, because the compiler may assume finite numbers
-  if constexpr (sizeof(Real) == 4) {
-    std::uint32_t bits;
-    std::memcpy(&bits, &value, 4);
-    return (bits & 0x7f800000u) != 0x7f800000u;
-  } else {
-    std::uint64_t bits;
-    std::memcpy(&bits, &value, 8);
-    return (bits & 0x7ff0000000000000ull) != 0x7ff0000000000000ull;
-  }
-}
 
 constexpr int images = 27;
 

@@ -4,25 +4,12 @@
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
-#include <cstring>
 #include <limits>
 
+#include "finite.hpp"
 #include "interface.h"
 
 namespace {
-
-// By its bits: the library is compiled for finite numbers.
-bool finite(float x) {
-  uint32_t bits;
-  std::memcpy(&bits, &x, sizeof bits);
-  return (bits & 0x7f800000u) != 0x7f800000u;
-}
-
-bool finite(double x) {
-  uint64_t bits;
-  std::memcpy(&bits, &x, sizeof bits);
-  return (bits & 0x7ff0000000000000u) != 0x7ff0000000000000u;
-}
 
 // Where a point lies: the lower corner of its cell, the share of each axis, and whether it lies anywhere.
 template <class Real, int D>
@@ -36,7 +23,7 @@ struct Place {
     node = 0, usable = true;
     for (int k = 0; k < D; ++k) {
       const Real place = (point[k] - Real(a.origin[k])) / Real(a.step[k]);
-      usable = usable && finite(place);
+      usable = usable && sph::finite(place);
       const Real low = usable ? std::min(std::max(std::floor(place), Real(0)), Real(a.counts[k] - 2)) : Real(0);
       share[k] = std::min(std::max(place - low, Real(0)), Real(1));
       node += int64_t(low) * stride, stride *= a.counts[k];

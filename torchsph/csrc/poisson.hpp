@@ -1,6 +1,5 @@
 // The pressure Poisson equation by conjugate gradients: positions and weights are packed once, only the field changes.
 #pragma once
-#include <cstring>
 #include <limits>
 #include <vector>
 
@@ -10,13 +9,6 @@ namespace sph {
 
 constexpr double alone = 1e-12;  // below this a diagonal entry belongs to a particle without neighbours
 constexpr double least = std::numeric_limits<double>::min();
-
-// By its bits: the library is compiled for finite numbers.
-inline bool finite(double x) {
-  std::uint64_t bits;
-  std::memcpy(&bits, &x, sizeof bits);
-  return (bits & 0x7ff0000000000000u) != 0x7ff0000000000000u;
-}
 
 // Sums over each member's particles, in double precision and in an order that does not depend on the threads.
 struct Totals {
