@@ -55,6 +55,21 @@ template <class Real, int D, std::uint32_t T> struct Pass {
     V field[at.fields];
   };
 
+  static Constants constants(const Coefficients& c, const KernelChoice& choice) {
+    const double h = c.length;
+    return {L::all(Real(1 / h)), L::all(Real(singularity * h * h)), L::all(Real(2 * c.artificial * h)),
+            L::all(Real(c.laminar)), L::all(Real(c.tensile)), Real(choice.support), choice.kind};
+  }
+
+  // The particles a, whose place is `home`, where a periodic image sees them.
+  static SPH_INLINE void move(Own& a, const V* home, std::int32_t image, const Lists<Real>& lists) {
+    if (!lists.periodic) return;
+    for (int d = 0; d < D; ++d) {
+      const int step = image_step(image, d);
+      a.field[d] = home[d] + (step ? Real(step * lists.period[d]) : Real(0));
+    }
+  }
+
   static SPH_INLINE void add(const Constants& k, const Own& a, const Partner<Real, at.fields>& b, Sums& s) {
     V gap[D], square{}, jump[D], approach{};
     for (int d = 0; d < D; ++d) {
@@ -172,8 +187,7 @@ template <class Real, int D, std::uint32_t T> struct Pass {
     for (std::int64_t g = 0; g < lists.clusters; ++g) {
       const Coefficients& c = members[lists.owner[g]];
       const double h = c.length;
-      const Constants k{L::all(Real(1 / h)), L::all(Real(singularity * h * h)), L::all(Real(2 * c.artificial * h)),
-                        L::all(Real(c.laminar)), L::all(Real(c.tensile)), Real(choice.support), choice.kind};
+      const Constants k = constants(c, choice);
       const Real per_value = Real(choice.sigma / std::pow(h, D)), per_slope = Real(choice.sigma / std::pow(h, D + 2));
       const Real* block = rows.block.data() + g * at.block();
       for (int group = 0; group < L::groups; ++group) {
@@ -184,11 +198,7 @@ template <class Real, int D, std::uint32_t T> struct Pass {
         Sums sums;
         for (const std::int32_t* list = lists.entries + lists.offset[g]; list[0] >= 0;) {
           const std::int32_t image = list[0], count = list[1];
-          if (lists.periodic)
-            for (int d = 0; d < D; ++d) {
-              const int step = image_step(image, d);
-              a.field[d] = home[d] + (step ? Real(step * lists.period[d]) : Real(0));
-            }
+          move(a, home, image, lists);
           list += 2;
           for (std::int32_t n = 0; n < count; n += L::partners)
             add(k, a, Partner<Real, at.fields>(rows.row.data(), list + n, at.stride()), sums);

@@ -3,7 +3,7 @@
 #include <limits>
 #include <vector>
 
-#include "passes.hpp"
+#include "coarse.hpp"
 
 namespace sph {
 
@@ -39,6 +39,7 @@ template <class Real> struct PoissonRoom {
   std::vector<Real> residual, direction, image, diagonal;
   std::vector<double> mean, scale, left, begun, fresh, old, curvature, along, beta, sums;
   std::vector<std::uint8_t> active;
+  CoarseRoom<Real> coarse;
 };
 
 template <class Real, int D> class Poisson {
@@ -49,6 +50,8 @@ template <class Real, int D> class Poisson {
   const Lists<Real>& lists;
   Rows<Real>& rows;
   PoissonRoom<Real>& room;
+  CoarseLevel<Real, D> coarse;
+  bool two_levels = false;
   Totals totals;
   const Real *mass, *source;
   Real* values;
@@ -56,6 +59,7 @@ template <class Real, int D> class Poisson {
  public:
   Poisson(const sph_poisson& given, const Lists<Real>& found, Rows<Real>& packed, PoissonRoom<Real>& kept)
       : p(given), lists(found), rows(packed), room(kept),
+        coarse(found, kept.coarse, static_cast<const Real*>(given.pass.mass), given.free, given.member, given.members),
         totals{given.pass.particles, given.members, given.member, given.pass.threads, {}},
         mass(static_cast<const Real*>(given.pass.mass)), source(static_cast<const Real*>(given.source)),
         values(static_cast<Real*>(given.values)) {}
@@ -67,6 +71,7 @@ template <class Real, int D> class Poisson {
     const double wanted = p.tolerance * p.tolerance;
     const auto going = [&](std::int64_t b) { return finite(r.left[b]) && r.left[b] > wanted * r.scale[b]; };
     for (std::int64_t b = 0; b < p.members; ++b) r.active[b] = going(b), p.count[b] = 0;
+    if (two_levels) coarse.solve(r.residual, r.active, r.fresh);
     for (std::int64_t turn = 0; turn < p.iterations && any(r.active); ++turn) {
       for (std::int64_t b = 0; b < p.members; ++b)
         r.beta[b] = p.count[b] > 0 ? r.fresh[b] / std::max(r.old[b], least) : 0.0;
@@ -79,6 +84,7 @@ template <class Real, int D> class Poisson {
       }
       descend();
       for (std::int64_t b = 0; b < p.members; ++b) r.active[b] = r.active[b] && going(b);
+      if (two_levels) coarse.solve(r.residual, r.active, r.fresh);
     }
     keep_better();
     for (std::int64_t b = 0; b < p.members; ++b) {
@@ -129,6 +135,7 @@ template <class Real, int D> class Poisson {
       r.residual[i] = p.free[i] ? source[i] - Real(r.mean[p.member[i]]) : Real(0);
       if (p.free[i]) sum[0] += double(mass[i]) * r.residual[i] * r.residual[i];
     });
+    two_levels = coarse.build(rows);
     apply(r.diagonal.data());
     totals.over(2, r.sums, [&](std::int64_t i, double* sum) {
       // from now on the inverse, the preconditioner
@@ -156,7 +163,8 @@ template <class Real, int D> class Poisson {
     auto& r = room;
 #pragma omp parallel for num_threads(p.pass.threads) schedule(static)
     for (std::int64_t i = 0; i < p.pass.particles; ++i)
-      r.direction[i] = r.diagonal[i] * r.residual[i] + Real(r.beta[p.member[i]]) * r.direction[i];
+      r.direction[i] = r.diagonal[i] * r.residual[i] + (two_levels ? coarse.answer(i) : Real(0)) +
+                       Real(r.beta[p.member[i]]) * r.direction[i];
     apply(nullptr);
     totals.over(1, r.curvature, [&](std::int64_t i, double* sum) {
       if (p.free[i]) sum[0] += double(mass[i]) * r.direction[i] * r.image[i];
@@ -175,7 +183,7 @@ template <class Real, int D> class Poisson {
     split();
   }
 
-  // image = A direction, and the diagonal of A where it is wanted
+  // image = A direction; where it is wanted, once, the diagonal of A and the coarse level too
   void apply(Real* diagonal) {
     const Real* field = room.direction.data();
 #pragma omp parallel for num_threads(lists.threads) schedule(static)
@@ -190,7 +198,9 @@ template <class Real, int D> class Poisson {
     out.laplacian = room.image.data();
     out.diagonal = diagonal;
     const KernelChoice kernel{p.pass.kernel, p.pass.support, p.pass.sigma};
-    Laplacian::run(lists, rows, kernel, reinterpret_cast<const Coefficients*>(p.pass.coefficients), out);
+    const auto* members = reinterpret_cast<const Coefficients*>(p.pass.coefficients);
+    if (diagonal && two_levels) coarse.assemble(rows, kernel, members, out);
+    else Laplacian::run(lists, rows, kernel, members, out);
   }
 };
 
