@@ -254,8 +254,8 @@ class Domain:
         ``wall`` is what the particles saw before the step; its distance is carried on to first order in the step,
         which is far below a spacing, so that one look-up per step does.
         """
-        if self.reservoirs is not None and self._open:
-            after = self.reservoirs.driven(after)
+        if self.reservoirs is not None and self._open and self.scheme.sound_speed is not None:
+            after = self.reservoirs.driven(after)  # incompressible steps drive them half-way
         if wall is None or not isinstance(self.scheme.wall, CompleteKernelWall):
             return after
         gap = self.scheme.wall.gap
