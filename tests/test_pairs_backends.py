@@ -110,23 +110,30 @@ class TestTerms:
             assert_close(got[1], wanted[1], dtype)
 
     def test_poisson(self, fast, dtype, dimension, periodic):
-        """The same iterates as conjugate gradients in torch: with a start and without, some particles held at 0."""
+        """The solution that conjugate gradients in torch find: with a start and without, some particles held at 0."""
         state, lengths, pairs, wanted_pairs, wide = self.arrange(fast, dtype, dimension, periodic)
         active = state.deviation > -0.015
         free = active & (state.pressure > -1.5)
-        singular, options = torch.tensor([True, False]), {"tolerance": 1e-3, "iterations": 15}
+        singular, single = torch.tensor([True, False]), dtype == torch.float32
+        asked = {"free": free, "active": active, "singular": singular, "iterations": 500}
         for start in (None, 0.1 * wide.velocity[:, 0]):
-            asked = {"free": free, "active": active, "singular": singular, **options}
             given = None if start is None else start.to(dtype)
-            got = fast.poisson(pairs, state, lengths, state.pressure, given, **asked)
-            wanted = REFERENCE.poisson(wanted_pairs, wide, lengths, wide.pressure, start, **asked)
-            assert_close(got.values, wanted.values, dtype)
-            assert torch.equal(got.converged, wanted.converged)
-            if dtype == torch.float64:
-                assert torch.equal(got.iterations, wanted.iterations)
-                torch.testing.assert_close(got.residual, wanted.residual, rtol=1e-6, atol=1e-9)
-                torch.testing.assert_close(got.mismatch, wanted.mismatch)
-            assert not bool(got.values[~free].any())
+            enough = 1e-5 if single else 1e-11
+            got = fast.poisson(pairs, state, lengths, state.pressure, given, tolerance=enough, **asked)
+            wanted = REFERENCE.poisson(
+                wanted_pairs, wide, lengths, wide.pressure, start, tolerance=1e-12, **asked
+            )
+            torch.testing.assert_close(
+                got.values.double(), wanted.values, rtol=0.0,
+                atol=float(wanted.values.abs().max()) * (2e-4 if single else 1e-9),
+            )
+            torch.testing.assert_close(got.mismatch, wanted.mismatch, rtol=1e-6, atol=1e-7 if single else 1e-12)
+            assert bool(got.converged.all()) and not bool(got.values[~free].any())
+            assert bool((got.iterations <= wanted.iterations).all())
+            short = fast.poisson(
+                pairs, state, lengths, state.pressure, given, tolerance=1e-5, **{**asked, "iterations": 3}
+            )
+            assert not bool(short.converged.any()) and short.iterations.tolist() == [3, 3]
 
     def test_interpolation(self, fast, dtype, dimension, periodic):
         state, lengths, _, _, wide = self.arrange(fast, dtype, dimension, periodic)

@@ -157,11 +157,14 @@ class Domain:
     def at(self, times: Tensor | float) -> None:
         """Set the present time of the members, s: (members,) float64 or one for all."""
         self._times = torch.as_tensor(times, dtype=torch.float64, device=self.device)
+        self._now: float | None = None
 
     @property
     def now(self) -> float:
         """Present time, s, on the average over the members."""
-        return float(self._times.mean())
+        if self._now is None:
+            self._now = float(self._times.mean())
+        return self._now
 
     def later(self, particles: Particles, step: Tensor) -> Particles:
         """Go on by ``step`` (members,), internal; the particles with what buffers do at that time."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -40,7 +41,7 @@ class Neighbourhood:
     support: Support
     wall: WallSample | None
 
-    @property
+    @cached_property
     def share(self) -> Tensor | float:
         """Part of each kernel inside the walls, (N,)."""
         return 1.0 if self.wall is None else self.wall.share.clamp_min(SMALLEST_SHARE)

@@ -8,6 +8,11 @@ from torch import Tensor
 
 from geometry import OrificePlane
 
+from .pairs.interface import square_length
+
+# half the width (spacings) over which what stands over an opening is blended in
+_RIM = 0.5
+
 
 class Frame:
     """An opening in internal units on the device."""
@@ -26,6 +31,7 @@ class Frame:
         self.area = float(self._plane.area)
         self.velocity = tensor(velocity)
         self.radius = float(np.linalg.norm(self._plane.outline, axis=1).max())
+        self._clear = float(self.inset(self.centre[None]).clamp_min(0.0))  # nothing of the rim is nearer to the middle
 
     def height(self, position: Tensor) -> Tensor:
         """Outward distance from the plane, (n,)."""
@@ -34,6 +40,14 @@ class Frame:
     def inset(self, position: Tensor) -> Tensor:
         """In-plane distance from the rim, (n,), positive over the opening."""
         return self._plane.lateral_distance(position)
+
+    def cover(self, position: Tensor) -> Tensor:
+        """Part of points (n, D) over the opening, (n,): blended in over a spacing at the rim."""
+        aside = square_length(position - self.centre) - self.height(position).square()
+        part = (aside < self._clear**2).to(position.dtype)
+        low, high = max(self._clear - _RIM, 0.0), self.radius + _RIM
+        rim = torch.nonzero((aside > low * low) & (aside < high * high)).squeeze(1)
+        return part.index_copy(0, rim, (self.inset(position[rim]) / (2.0 * _RIM) + 0.5).clamp(0.0, 1.0))
 
     def behind(self, position: Tensor) -> Tensor:
         """(n,) bool: points (n, D) less than half a spacing before the opening, or in the channel behind it."""

@@ -110,7 +110,7 @@ class Reservoirs:
         for _, frame in self.active():
             height = frame.height(particles.position)
             row = torch.nonzero(height.abs() < _BLEND).squeeze(1)
-            over = (frame.inset(particles.position[row]) + 0.5).clamp(0.0, 1.0)
+            over = frame.cover(particles.position[row])
             share = 0.5 - 0.5 / _BLEND * height[row]
             part = part.index_put((row,), torch.lerp(part[row], share * share * (3.0 - 2.0 * share), over))
         # in double: thousands of equal masses added in single precision drift by more than the difference
@@ -167,19 +167,26 @@ class Reservoirs:
         With several valves open at once the cavity fills through the first and empties through the last of them;
         openings of one region share by area.
         """
+        fills, empties = self._passes(number)
+        mine = self.openings[number].label
+        total = sum(frame.area for n, frame in self.active() if self.openings[n].label == mine)
+        if not (fills and empties):
+            inflow = inflow.clamp_min(0.0) if fills else inflow.clamp_max(0.0) if empties else torch.zeros_like(inflow)
+        return inflow * (self.frame(number).area / total)
+
+    def _passes(self, number: int) -> tuple[bool, bool]:
+        """Whether the cavity fills, and whether it empties, through an opening."""
         given = {self.openings[n].label for n in self.given}
         regions = sorted(set(self.domain.open_regions) - given)
         mine = self.openings[number].label
-        part = inflow.clamp_min(0.0) * (mine == regions[0]) + inflow.clamp_max(0.0) * (mine == regions[-1])
-        total = sum(frame.area for n, frame in self.active() if self.openings[n].label == mine)
-        return part * (self.frame(number).area / total)
+        return mine == regions[0], mine == regions[-1]
 
     def _lead(self, number: int) -> float:
         """Length of the free channel before the buffer of an opening: 0 where fluid enters in the present interval."""
         if not self.run_out or number in self.given:
             return 0.0
-        middle = torch.tensor([self.domain.middle], dtype=torch.float64, device=self.domain.device)
-        return self.run_out if float(self._flux_through(number, self.inflow(middle))) < 0.0 else 0.0
+        inflow = np.interp(self.domain.walls.moments.wrapped(self.domain.middle), self.times, self.flux)
+        return self.run_out if inflow < 0.0 and self._passes(number)[1] else 0.0
 
     def opened(self, particles: Particles) -> Particles:
         """Make the buffers of valves that are open and have none, drop those of valves that have shut."""

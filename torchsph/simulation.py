@@ -64,7 +64,9 @@ class Simulation:
         self.parameters = Parameters.of(scheme, scene.fluid)
         self._coefficients = Coefficients.of(self.parameters, self.units, scene.fluid.density)
         self._backend = choose_backend(simulator.backend, simulator.device)
-        search = PairSearch(self._backend, self.domain.support_radius, _SEARCH_MARGIN, self.domain.period)
+        # incompressible steps see their neighbours once; lists of that moment also make them independent of a batch
+        margin = 0.0 if isinstance(scheme, Projection) else _SEARCH_MARGIN
+        search = PairSearch(self._backend, self.domain.support_radius, margin, self.domain.period)
         buffered = self.domain.reservoirs is not None
         if isinstance(scheme, Projection):
             check_filled(scheme, self.domain, particles, self.time)

@@ -15,7 +15,7 @@ constexpr double in_aggregate[4] = {0, 0, 12, 36};  // particles: cells 3.5 spac
 template <class Real> struct CoarseRoom {
   std::vector<std::int32_t> of_cluster, of_particle, order;  // aggregate, in its member; clusters by aggregate
   std::vector<std::int64_t> begin, first, matrix_at;         // (aggregates + 1) in order; (members + 1) twice
-  std::vector<double> matrix, given, right;                  // upper factors row by row; right sides; answers
+  std::vector<double> matrix, given, right, weight;          // upper factors row by row; right sides; answers; masses
   std::vector<Real> answer;
   std::vector<std::int32_t> owner;                           // (aggregates) member
   std::vector<std::uint8_t> usable;                          // (members)
@@ -63,6 +63,9 @@ template <class Real, int D> class CoarseLevel {
         if (group[i] != lists.owner[g]) return false;
         if (free[i]) r.of_particle[i] = std::int32_t(r.first[group[i]]) + r.of_cluster[g];
       }
+    r.weight.assign(r.owner.size(), 0.0);
+    for (std::int64_t i = 0; i < lists.particles; ++i)
+      if (r.of_particle[i] >= 0) r.weight[r.of_particle[i]] += mass[i];
     r.given.resize(r.owner.size()), r.right.resize(r.owner.size()), r.answer.assign(r.owner.size(), Real(0));
     return true;
   }
@@ -89,19 +92,26 @@ template <class Real, int D> class CoarseLevel {
   }
 
   // Answers to `residual` (N,) of the active members, and what they add to its product with the preconditioned one.
-  void solve(const std::vector<Real>& residual, const std::vector<std::uint8_t>& active, std::vector<double>& energy) {
+  // Where only differences count neither has a mean: of the rounding in that of the residual nothing must be made.
+  void solve(const std::vector<Real>& residual, const std::vector<std::uint8_t>& active, const std::uint8_t* singular,
+             std::vector<double>& energy) {
 #pragma omp parallel for num_threads(lists.threads) schedule(dynamic, 1)
     for (std::int64_t b = 0; b < members; ++b) {
       if (!active[b] || !r.usable[b]) continue;
       const std::int64_t first = r.first[b], size = r.first[b + 1] - first;
-      for (std::int64_t a = first; a < first + size; ++a) r.given[a] = r.right[a] = collected(a, residual);
-      substitute(r.matrix.data() + r.matrix_at[b], size, r.right.data() + first);
-      double sum = 0;
+      double total = 0, mean = 0, product = 0, weight = 0;
       for (std::int64_t a = first; a < first + size; ++a) {
-        r.answer[a] = Real(r.right[a]);
-        sum += r.given[a] * r.right[a];
+        r.given[a] = r.right[a] = collected(a, residual);
+        total += r.given[a], weight += r.weight[a];
       }
-      energy[b] += sum;
+      for (std::int64_t a = first; singular[b] && a < first + size; ++a) r.right[a] -= total / weight * r.weight[a];
+      substitute(r.matrix.data() + r.matrix_at[b], size, r.right.data() + first);
+      for (std::int64_t a = first; singular[b] && a < first + size; ++a) mean += r.weight[a] * r.right[a] / weight;
+      for (std::int64_t a = first; a < first + size; ++a) {
+        r.answer[a] = Real(r.right[a] - mean);
+        product += r.given[a] * (r.right[a] - mean);
+      }
+      energy[b] += product;
     }
   }
 

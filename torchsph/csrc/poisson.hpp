@@ -71,7 +71,7 @@ template <class Real, int D> class Poisson {
     const double wanted = p.tolerance * p.tolerance;
     const auto going = [&](std::int64_t b) { return finite(r.left[b]) && r.left[b] > wanted * r.scale[b]; };
     for (std::int64_t b = 0; b < p.members; ++b) r.active[b] = going(b), p.count[b] = 0;
-    if (two_levels) coarse.solve(r.residual, r.active, r.fresh);
+    if (two_levels) coarse.solve(r.residual, r.active, p.singular, r.fresh);
     for (std::int64_t turn = 0; turn < p.iterations && any(r.active); ++turn) {
       for (std::int64_t b = 0; b < p.members; ++b)
         r.beta[b] = p.count[b] > 0 ? r.fresh[b] / std::max(r.old[b], least) : 0.0;
@@ -84,7 +84,7 @@ template <class Real, int D> class Poisson {
       }
       descend();
       for (std::int64_t b = 0; b < p.members; ++b) r.active[b] = r.active[b] && going(b);
-      if (two_levels) coarse.solve(r.residual, r.active, r.fresh);
+      if (two_levels) coarse.solve(r.residual, r.active, p.singular, r.fresh);
     }
     keep_better();
     for (std::int64_t b = 0; b < p.members; ++b) {
