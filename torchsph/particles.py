@@ -63,7 +63,13 @@ class Particles:
 
     def changed(self, **values: Tensor) -> Particles:
         """A copy with some arrays replaced."""
-        return replace(self, **values)
+        # every step asks a dozen times; ``dataclasses.replace`` takes four times as long over it
+        unknown = values.keys() - self.__dict__.keys()
+        if unknown:
+            raise TypeError(f"particles have no {', '.join(sorted(unknown))}")
+        copy = object.__new__(Particles)
+        copy.__dict__.update(self.__dict__, **values)
+        return copy
 
     def select(self, keep: Tensor) -> Particles:
         """The particles where ``keep`` (N,) bool, or the indices in ``keep``."""

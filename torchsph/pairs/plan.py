@@ -140,7 +140,7 @@ def coefficients(support: Support, momentum: MomentumTerms | None, members: int)
             tensile = momentum.tensile / _shape_at(support, momentum.tensile_distance) ** 4
     values = (support.length, artificial, laminar, tensile)
     if not any(isinstance(value, Tensor) for value in values):  # every pass asks
-        return torch.tensor(values, dtype=torch.float64).repeat(members, 1)
+        return torch.tensor([values] * members, dtype=torch.float64)
     table = torch.empty((members, 4), dtype=torch.float64)
     for column, value in enumerate(values):
         table[:, column] = value if not isinstance(value, Tensor) or value.ndim == 0 else value[:members]
