@@ -14,9 +14,10 @@ Scheme = WeaklyCompressible | Projection
 _THESIS_RATIO = 16 ** (1 / 3) / 3
 
 # Incompressible steps, for flow that fills a heart's chamber. Error over persistence's on a ventricle at 1 mm, 5 / 10 /
-# 20 / 40 ms ahead: .57 / .48 / .40 / .34 with steps of up to 0.7 ms; .57 / .48 / .39 / .34 with 0.5 ms at 1.2 times
-# the cost; .58 / .50 / .41 / .35 with 1 ms at 0.8; weakly compressible .57 / .47 / .40 / .34 at twice the cost.
-_PROJECTION = Projection(max_step=7e-4, courant=0.4, tolerance=1.5e-2)
+# 20 / 40 ms ahead: .57 / .48 / .40 / .34 with steps of up to 0.7 ms; .59 / .50 / .41 / .35 with 1 ms at 0.75 times the
+# cost; weakly compressible .57 / .47 / .40 / .34 at three times. A relaxation of 2 gains .01 at 40 ms, but its
+# disturbances are half of the error in a pipe, and keep a vortex in a periodic box from converging.
+_PROJECTION = Projection(max_step=7e-4, courant=0.4, tolerance=1.5e-2, relaxation=4.0)
 
 PRESETS: dict[str, Scheme] = {
     "default": _PROJECTION,

@@ -241,25 +241,30 @@ class Simulation:
         if bool(waiting.any()):
             after, acceleration = _held(waiting, before, after), _held_rows(waiting, before, push, acceleration)
         self.particles, self._acceleration, done = after, acceleration, done + step
-        lowest, highest = (after.per_member(after.deviation, way) for way in ("amin", "amax"))
-        self.record.note_density(lowest, highest)
-        broken = self._broken(lowest, highest) & ~self.record.failed
+        broken = self._broken() & ~self.record.failed
         if self._work is not None:
             self._work.note(before, stepped, wall, inner, self._stepper, (step > 0) & ~broken)
         if bool(broken.any()):
             done = self._recover(broken, before, push, done, checkpoints)
         return done
 
-    def _broken(self, lowest: Tensor, highest: Tensor) -> Tensor:
-        """Members (members,) bool with a particle that is not finite, or denser or thinner than a rollback allows."""
-        p, options = self.particles, self.simulator.scheme.rollback
+    def _broken(self) -> Tensor:
+        """Members (members,) bool with a particle that is not finite, or denser or thinner than a rollback allows.
+
+        Notes the densities on the way; in an incompressible fluid they do not change.
+        """
+        p, scheme = self.particles, self.simulator.scheme
         broken = torch.zeros_like(self.record.failed)
         # a sum is finite only if all its terms are; which they are is looked up only where it is not
         if not math.isfinite(float(p.position.sum() + p.velocity.sum() + p.deviation.sum())):
             finite = torch.isfinite(p.position).all(1) & torch.isfinite(p.velocity).all(1) & torch.isfinite(p.deviation)
             broken = p.per_member((~finite).to(torch.int64), "sum") > 0
-        if options is not None:
-            broken |= (1.0 + lowest < options.density[0]) | (1.0 + highest > options.density[1])
+        if scheme.sound_speed is not None:
+            lowest, highest = (p.per_member(p.deviation, way) for way in ("amin", "amax"))
+            self.record.note_density(lowest, highest)
+            if scheme.rollback is not None:
+                least, most = scheme.rollback.density
+                broken |= (1.0 + lowest < least) | (1.0 + highest > most)
         return broken
 
     def _recover(

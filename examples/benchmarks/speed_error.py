@@ -1,6 +1,7 @@
 """Error against seconds: vortices in the plane and in space, a channel and a ventricle, over resolution and options.
 
     python examples/benchmarks/speed_error.py [--quick] [--json FILE] [--picture FILE] [--flows NAME ...] [--threads N]
+        [--recording FILE.h5]
 
 A curve is one set of options, its points are resolutions; CPU seconds (which a shared machine falsifies least) and
 wall seconds are those of the steps alone, for the ventricle of the whole forecast.
@@ -10,19 +11,12 @@ wall seconds are those of the steps alone, for the ventricle of the whole foreca
 - channel: plane Poiseuille flow started from rest, RMS error over the largest velocity at t = 0.5.
 - pipe: steady flow in a round pipe from its exact profile on, relative L2 error of the velocity after 0.2 s.
 - ellipsoid: the core of an ejecting ellipsoid at three phases, relative L2 error against its potential flow.
-- ventricle: NRMSE of forecasts 20 ms ahead on the sample recording that comes with torchsph.
+- ventricle: error of forecasts over that of persistence, mean of 10, 20 and 40 ms ahead, on the sample recording that
+  comes with torchsph or on another; the time is that of seeding, imposing and stepping, without the walls' tables.
 
 --quick takes coarse resolutions and, in the plane and in space, a fifth of the time: under a minute.
 
-The results beside it are of older code: "default preset" there is the weakly compressible one, the projection had twice
-the cost, and there is no pipe and no ellipsoid yet.
-
-Measured (results/speed_error.json and .png): in the plane 1.1 % in 0.7 CPU seconds (40^2) and 0.6 % in 1.4 (60^2).
-There 0.7 of the speed of sound costs 0.7 and is no worse; a narrower kernel or twice the speed of sound is slower and
-worse, also in space. In space the incompressible scheme is as good as the options for periodic flows at a quarter of
-the time (24^3: 1.4 % in 1.2 s against 1.7 % in 5.6 s); in the plane it is behind. In the ventricle both schemes lie
-on one line, .18 and .20 in 3 s at 1.2 mm. That preset is poor for vortices in a
-periodic box (16 % at 40^2: its shifting leaves disorder there). PySPH's vortex: peers_vortex.py.
+@@MEASURED@@
 """
 
 import argparse
@@ -33,6 +27,7 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
@@ -41,12 +36,23 @@ import torch
 from walls import steady_pipe
 
 import geometry
-from torchsph import PotentialWall, Scene, Simulator, WeaklyCompressible, preset, skill, validation
+from torchsph import (
+    GammaRamp,
+    PotentialWall,
+    Projection,
+    Scene,
+    Simulator,
+    WeaklyCompressible,
+    preset,
+    skill,
+    validation,
+)
 from torchsph.data import sample_truth
 from torchsph.presets import Scheme
 from torchsph.validation_ellipsoid import PulsatingEllipsoid
 from torchsph.validation_runs import channel, channel_error, kinetic_energy, taylor_green, taylor_green_error
 
+SAMPLE = sample_truth()
 DECAY_TIME = 100 / (8 * math.pi**2)
 # kinetic energy at t = 1 ... 5, Re 100: pseudo-spectral, 48^3 modes, Runge-Kutta 4 with steps of 0.02 (JAX-Fluids on
 # 64^3 cells agrees within 0.1 %)
@@ -146,18 +152,23 @@ def ellipsoid(resolution: float, scheme: Scheme, backend: str, quick: bool) -> t
     return *timed(action), run.particles.count * int(run.record.steps)
 
 
-def ventricle(resolution: float, scheme: Scheme, backend: str, quick: bool) -> tuple[float, float, float, float]:
-    """Forecasts of the sample recording 20 ms ahead; ``resolution`` is the spacing in mm."""
-    recording = geometry.read_recording(str(sample_truth()))
+def ventricle(
+    resolution: float, scheme: Scheme, backend: str, quick: bool, file: Path = SAMPLE
+) -> tuple[float, float, float, float]:
+    """Forecasts of a recording; ``resolution`` is the spacing in mm."""
+    recording = geometry.read_recording(str(file))
+    model = Simulator(Scene.from_recording(recording, 1e-3 * resolution), scheme, backend=backend)
+    every = recording.frames if quick else max(recording.frames // 8, 1)
+    leads = (0.01,) if quick else (0.01, 0.02, 0.04)
+    skill(recording, model, leads, every=every)  # makes the walls' tables
     steps = 0.0
 
     def action() -> float:
         nonlocal steps
-        scene = Scene.from_recording(recording, 1e-3 * resolution)
-        model = Simulator(scene, scheme, backend=backend)
-        result = skill(recording, model, (0.02,), every=recording.frames if quick else 12)
+        result = skill(recording, model, leads, every=every)
         steps = model.start(float(recording.time[0])).particles.count * float(result.info["steps"])
-        return result.leads[0]["nrmse"]["model"]
+        ratios = [row["nrmse"]["model"] / row["nrmse"]["persistence"] for row in result.leads]
+        return sum(ratios) / len(ratios)
 
     return *timed(action), steps
 
@@ -166,6 +177,7 @@ def ventricle(resolution: float, scheme: Scheme, backend: str, quick: bool) -> t
 PRESET_CURVES = {
     "weakly compressible preset": preset("weakly_compressible"), "projection": preset("projection", max_step=None),
 }  # fmt: skip
+PERIODIC_PROJECTION = Projection(**validation.PERIODIC_PROJECTION)
 REFERENCE = {"reference backend": {"backend": "reference"}}
 FLOWS = {
     "plane": Flow(plane, WeaklyCompressible(**validation.PERIODIC_OPTIONS), (20, 40, 60), (16, 24), {
@@ -173,11 +185,12 @@ FLOWS = {
         "sound speed 7": {"sound_speed": 7.0},
         "quintic, h = 1.5": FINER, "Wendland C4, h = 2.4": SMOOTHER, "h = 1.6": {"smoothing_ratio": 1.6},
         "predictor-corrector": {"order": "predictor_corrector"}, "symplectic Euler": {"order": "symplectic"},
+        "projection, for periodic flows": PERIODIC_PROJECTION,
     } | REFERENCE, "relative L2 velocity error"),
     "space": Flow(space, WeaklyCompressible(**validation.PERIODIC_OPTIONS_3D), (16, 20, 24), (16,), {
         "options for periodic flows": {}, "sound speed 20": {"sound_speed": 20.0},
         "Wendland C4, h = 2.2": SMOOTHER | {"smoothing_ratio": 2.2}, "h = 1.4": {"smoothing_ratio": 1.4},
-        "shifting 8": {"shifting": 8.0},
+        "shifting 8": {"shifting": 8.0}, "projection, for periodic flows": PERIODIC_PROJECTION,
     }, "error of the kinetic energy"),
     "channel": Flow(poiseuille, WeaklyCompressible(**validation.CHANNEL_OPTIONS), (10, 20, 40), (10, 20), {
         "options for channels": {}, "sound speed 20": {"sound_speed": 20.0}, "Wendland C4, h = 2.4": SMOOTHER,
@@ -191,11 +204,13 @@ FLOWS = {
     "ellipsoid": Flow(
         ellipsoid, preset("weakly_compressible"), (12, 16, 20), (10,), {}, "relative L2 error of the core",
     ),
-    "ventricle": Flow(ventricle, preset("weakly_compressible"), (2.0, 1.5, 1.2), (2.5,), {
+    "ventricle": Flow(ventricle, preset("weakly_compressible"), (1.5, 1.2, 1.0), (2.5,), {
+        "projection": preset("projection"),
+        "projection, steps to 1 ms": preset("projection", max_step=1e-3, courant=0.6),
+        "projection, steps to 0.5 ms": preset("projection", max_step=5e-4, courant=0.27),
         "sound speed 3.5": {"sound_speed": 3.5}, "sound speed 10": {"sound_speed": 10.0},
-        "Wendland C4, h = 1.6": {"kernel": "wendland_c4", "smoothing_ratio": 1.6}, "h = 1.6": {"smoothing_ratio": 1.6},
-        "position Verlet": {"order": "verlet"},
-    } | REFERENCE, "NRMSE at 20 ms", " mm", ("reference backend", "h = 1.6")),
+        "gamma from 1 to 7 in 10 ms": {"gamma": 7.0, "gamma_ramp": GammaRamp()},
+    }, "error / error of persistence", " mm"),
 }  # fmt: skip
 
 
@@ -233,9 +248,9 @@ def picture(rows: list[dict], file: Path) -> None:
     for panel, name in zip(axes.flat, flows, strict=False):
         for k, curve in enumerate(dict.fromkeys(row["curve"] for row in rows if row["flow"] == name)):
             mine = [row for row in rows if row["flow"] == name and row["curve"] == curve]
-            style = "ks--" if k == 0 else "o-" if k == 1 else ".--"
+            style = "ks--" if k == 0 else "o-" if "projection" in curve else ".--"
             seconds, errors = [row["cpu_s"] for row in mine], [row["error"] for row in mine]
-            panel.loglog(seconds, errors, style, linewidth=2.5 if k == 1 else 1.0, label=curve)
+            panel.loglog(seconds, errors, style, linewidth=1.0 + ("projection" in curve), label=curve)
             for row in mine if k < 2 else []:
                 text, place = f"{row['resolution']:g}{FLOWS[name].unit}", (row["cpu_s"], row["error"])
                 panel.annotate(text, place, xytext=(4, 5), textcoords="offset points", fontsize=8)
@@ -255,13 +270,15 @@ def main() -> None:
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the rows here")
     parser.add_argument("--picture", type=Path, metavar="FILE", help="write error against seconds here (PNG)")
     parser.add_argument("--flows", nargs="+", choices=FLOWS, default=list(FLOWS), help="default: all")
+    parser.add_argument("--recording", type=Path, default=SAMPLE, help="of the ventricle (default: the sample)")
     parser.add_argument("--threads", type=int, default=1, help="threads of torch (default 1)")
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
     print(f"{'flow':<10} {'curve':<28} {'n':>5} {'error':>8} {'CPU s':>7} {'M steps/s':>9}")
     rows: list[dict] = []
+    flows = FLOWS | {"ventricle": replace(FLOWS["ventricle"], measure=partial(ventricle, file=options.recording))}
     for name in options.flows:
-        rows += measured(name, FLOWS[name], options.quick)
+        rows += measured(name, flows[name], options.quick)
         load = os.getloadavg()[0]
         print(f"load of the machine: {load:.2f}")
         if options.json:  # after each flow: a full run takes minutes
