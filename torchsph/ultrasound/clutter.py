@@ -15,7 +15,6 @@ import torch
 from scipy.signal import firwin
 from torch import Tensor
 
-
 IMAGES_AT_ONCE = 16  # that an FIR filter makes: more of them would multiply mostly by zeros
 
 
@@ -69,9 +68,9 @@ class FIRFilter:
             )
         valid, parts = len(iq) - self.taps + 1, torch.view_as_real(iq.resolve_conj()).reshape(len(iq), -1)
         rows = min(valid, IMAGES_AT_ONCE)
-        band = parts.new_zeros((rows, rows + self.taps - 1))
+        band, design = parts.new_zeros((rows, rows + self.taps - 1)), parts.new_tensor(self.coefficients())
         for row in range(rows):
-            band[row, row : row + self.taps] = parts.new_tensor(self.coefficients())  # symmetric: needs no turning round
+            band[row, row : row + self.taps] = design  # symmetric, so convolution and correlation agree
         filtered = parts.new_empty((valid, parts.shape[1]))
         for first in range(0, valid, rows):  # products with a band matrix: one pass over memory, not one per tap
             last = min(first + rows, valid)
