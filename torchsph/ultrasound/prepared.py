@@ -139,16 +139,23 @@ def turn_gradient(volume: Tensor, half: tuple[int, int, int]) -> Tensor:
     """Change along each axis, (Z, Y, X, 3) rad per node, of how much echoes turn from one image to the next.
 
     The turn is the phase of the lag-one autocorrelation (Kasai et al., IEEE Trans. Sonics Ultrason. 32,
-    1985); its gradient is that of neighbouring nodes against each other, averaged over twice the kernel:
-    with only three numbers per kernel taken from the data, little of the speckle's own phase gets into them.
+    1985), averaged over twice the kernel: with few numbers taken from the data, little of the speckle's own phase
+    gets into them. Nodes weigh by amplitude instead of power, so that neither the brightest speckle nor what is
+    left of a wall nearby speaks for all. The change is that to half a kernel further on, either side; from node to
+    node it would be that of single speckles, whose nodes turn together whatever the shear.
     """
-    product = torch.linalg.vecdot(volume[..., :-1], volume[..., 1:])  # conjugates the first
-    gradient = volume.real.new_zeros((*product.shape, 3))
+    turn = torch.linalg.vecdot(volume[..., :-1], volume[..., 1:])  # conjugates the first
+    amplitude = torch.linalg.vector_norm(volume, dim=-1)
+    turn /= amplitude.clamp_min(torch.finfo(amplitude.dtype).tiny)
+    for axis, h in enumerate(half):
+        turn = box_sum(turn, 4 * h + 1, axis)
+    gradient = volume.real.new_zeros((*turn.shape, 3))
     for axis in (axis for axis in range(3) if half[axis]):
-        # symmetric: a node with the next, and the one before with it
-        step = product.roll(1, axis).conj() * product
-        step = step + step.roll(-1, axis)
-        for other, h in enumerate(half):
-            step = box_sum(step, 4 * h + 1, other)
-        gradient[..., axis] = step.angle()
+        step = half[axis]
+        rest = turn.shape[axis] - step
+        change = turn.narrow(axis, 0, rest).conj() * turn.narrow(axis, step, rest)
+        both = torch.zeros_like(turn)
+        both.narrow(axis, step, rest).add_(change)  # from the node before
+        both.narrow(axis, 0, rest).add_(change)  # to the one after
+        gradient[..., axis] = both.angle() / step
     return gradient
