@@ -43,6 +43,12 @@ def convolve_axis(field: Tensor, kernel: Tensor, axis: int, *, padded: bool) -> 
     return total
 
 
+def power(samples: Tensor) -> Tensor:
+    """|samples|^2 of complex samples, without the square root that ``abs`` takes (several times faster)."""
+    parts = torch.view_as_real(samples.resolve_conj())
+    return torch.addcmul(parts[..., 0].square(), parts[..., 1], parts[..., 1])
+
+
 def box_sum(field: Tensor, nodes: int, axis: int) -> Tensor:
     """Sums over windows of ``nodes`` (odd) nodes along one axis, zeros outside; real or complex.
 
