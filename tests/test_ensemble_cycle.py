@@ -241,7 +241,7 @@ def test_observations_noisier_than_said_are_noticed(given):
     told = replace(given.measured, sigma=np.full_like(given.measured.velocity, 0.004))
     splines = FrameSmoother(told, Smoother())
     fine = made_model(told, FINE)
-    run = assimilate(told, fine, coarse=given.model, members=8, splines=splines, smoothed=given.smoothed, seed=1)
+    run = assimilate(told, fine, coarse=given.model, members=3, splines=splines, smoothed=given.smoothed, seed=1)
     assert min(run.info["observation_error_scale"]) > 4.0
     assert any("overconfident" in words for words in run.info["filter"]["warnings"])
     assert nrmse(run.recording) < 1.1 * nrmse(given.smoothed)

@@ -38,6 +38,8 @@ from .ultrasound.fields import fwhm_to_deviation
 
 # share of the forecast's error variance that an analysis leaves at least
 _LEAST_LEFT = 0.25
+# draws from the ensemble whose splines tell how large its spread is: each costs a thirtieth of an analysis
+_DRAWS = 3
 
 
 class Cycle:
@@ -206,9 +208,9 @@ class Cycle:
         weight = torch.where(screened.used, 1.0 / screened.variance, 0.0)
         if self.offered is not None:
             self.gain.learn(self._seen(self.offered, masks, look), screened.innovation, weight)
-        anomaly = self._anomaly(look)
+        drawn = self._drawn(look)
         tasks = [
-            partial(self._splines, torch.stack([screened.innovation, anomaly]), weight, look, frame),
+            partial(self._splines, torch.cat([screened.innovation[None], drawn]), weight, look, frame),
             partial(self._filtered, joint, look, positions, state.control, frame, self._forked()),
         ]
         (found, choice), (analysis, regions) = shared(tasks)
@@ -217,7 +219,7 @@ class Cycle:
         self._record(analysis, look, forecast, inside, frame)
         self.offered = self._increments(analysis, found, inside, state.control, frame)
         change = torch.einsum("j,jd...->d...", self.gain.weight.to(torch.float32), self.offered)
-        self._match_spread(masks, look, weight, anomaly, found)
+        self._match_spread(masks, look, weight, drawn, found)
         self.scale.learn(analysis, look.observations, look.group)
         control = state.control + change
         anomalies, parameters = self._on_grid(analysis.ensemble[:, :size] - analysis.mean[:size], inside), {}
@@ -248,10 +250,10 @@ class Cycle:
         """A generator of its own for what one process alone may do."""
         return torch.Generator().manual_seed(int(torch.randint(2**62, (), generator=self.generator)))
 
-    def _anomaly(self, look: Look) -> Tensor:
-        """(m,) one draw from the ensemble as it is observed."""
-        draw = torch.randn(self.count, generator=self.generator, dtype=torch.float64) / (self.count - 1) ** 0.5
-        return draw @ torch.nan_to_num(look.members - look.members.mean(0)).double()
+    def _drawn(self, look: Look) -> Tensor:
+        """(_DRAWS, m) draws from the ensemble's deviations as they are observed."""
+        draw = torch.randn((_DRAWS, self.count), generator=self.generator, dtype=torch.float64)
+        return draw @ torch.nan_to_num(look.members - look.members.mean(0)).double() / (self.count - 1) ** 0.5
 
     def _seen(self, fields: Tensor, masks: list[Tensor], look: Look) -> Tensor:
         """(J, m) fields (J, D, *shape) where they are observed; 0 where nothing of them is."""
@@ -288,16 +290,16 @@ class Cycle:
         return (target / after) ** 0.5 if after > 0 else 1.0
 
     def _match_spread(
-        self, masks: list[Tensor], look: Look, weight: Tensor, anomaly: Tensor, found: Tensor
+        self, masks: list[Tensor], look: Look, weight: Tensor, drawn: Tensor, found: Tensor
     ) -> None:
-        """Compare what the splines (2, D, *shape) find in the innovations and in a draw from the ensemble (m,)."""
+        """Compare what splines (1 + k, D, *shape) find in the innovations and in draws from the ensemble (k, m)."""
         if not len(found):
             return
         parts, first = self.grid.dimension, self.options.increments.index("spline") * self.grid.dimension
         seen = self._seen(self.offered, masks, look)
         followed = self.gain.weight @ seen
         shown = float((weight * seen[first : first + parts].sum(0) * followed).sum())
-        self.spread.learn(shown, float((weight * self._seen(found[1:], masks, look)[0] * anomaly).sum()))
+        self.spread.learn(shown, float((weight * self._seen(found[1:], masks, look) * drawn).sum()) / len(drawn))
 
     def _coast(self, state: Ensemble, mask: Tensor, missing: int, time: float) -> None:
         """Nothing was measured: the forecast is the analysis."""
