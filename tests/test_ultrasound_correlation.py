@@ -64,7 +64,7 @@ def test_compiled_sums_over_images_and_boxes_are_those_of_torch(dtype, close):
         volume, power, turn = one.arrange(images, margin, turns=True)
         found.append([
             volume, power, turn, one.mean_power(images), one.box_sums(power, middle, half),
-            *(one.turn_gradient(turn, widths)(middle) for widths in (half, (0, 2, 1))),
+            *(one.sums_around(turn, widths)(middle) for widths in (half, (0, 9, 5))),
         ])  # fmt: skip
     for compiled, reference in zip(found[1], found[0], strict=True):
         torch.testing.assert_close(compiled, reference, atol=close, rtol=close)

@@ -124,53 +124,9 @@ void box_sums(const sph_boxes& a) {
   }
 }
 
-// Sums over a box of conj(f(k - 1)) f(k) + conj(f(k)) f(k + 1) along each axis, of a complex field f, 0 outside.
-template <class Real>
-void neighbour_sums(const sph_boxes& a) {
-  const auto* field = static_cast<const Real*>(a.field);
-  const int64_t step[3] = {2 * a.shape[1] * a.shape[2], 2 * a.shape[2], 2};
-#pragma omp parallel num_threads(a.threads)
-  {
-    std::vector<Real> sums(2 * (2 * a.reach[2] + 2));
-#pragma omp for schedule(static)
-    for (int64_t p = 0; p < a.points; ++p) {
-      const Box box(a, a.middle + 3 * p);
-      for (int axis = 0; axis < 3; ++axis) {
-        Real* out = static_cast<Real*>(a.out) + 2 * (3 * p + axis);
-        out[0] = out[1] = 0;
-        if (a.reach[axis] == 0) continue;
-        // pairs of a node and the next along the axis, by their first node
-        int64_t low[3], high[3];
-        for (int k = 0; k < 3; ++k) low[k] = box.low[k], high[k] = box.high[k];
-        low[axis] = std::max<int64_t>(0, low[axis] - 1), high[axis] = std::min(a.shape[axis] - 2, high[axis]);
-        const int64_t count = high[2] - low[2] + 1;
-        // those with both nodes in the box count twice
-        const auto times = [&](int64_t k) { return Real((k >= box.low[axis]) + (k < box.high[axis])); };
-        std::fill(sums.begin(), sums.end(), Real(0));
-        Real *real = sums.data(), *imaginary = real + std::max<int64_t>(count, 0);
-        for (int64_t z = low[0]; z <= high[0]; ++z)
-          for (int64_t y = low[1]; y <= high[1]; ++y) {
-            const Real* one = field + z * step[0] + y * step[1] + low[2] * step[2];
-            const Real *other = one + step[axis], weight = axis == 2 ? Real(1) : times(axis == 0 ? z : y);
-            for (int64_t i = 0; i < count; ++i) {
-              real[i] += weight * (one[2 * i] * other[2 * i] + one[2 * i + 1] * other[2 * i + 1]);
-              imaginary[i] += weight * (one[2 * i] * other[2 * i + 1] - one[2 * i + 1] * other[2 * i]);
-            }
-          }
-        for (int64_t i = 0; i < count; ++i) {
-          const Real weight = axis == 2 ? times(low[2] + i) : Real(1);
-          out[0] += weight * real[i], out[1] += weight * imaginary[i];
-        }
-      }
-    }
-  }
-}
-
 }  // namespace
 
 extern "C" void sph_arrange_f32(const sph_images* arguments) { Arranger<float>(*arguments).run(); }
 extern "C" void sph_arrange_f64(const sph_images* arguments) { Arranger<double>(*arguments).run(); }
 extern "C" void sph_box_sums_f32(const sph_boxes* arguments) { box_sums<float>(*arguments); }
 extern "C" void sph_box_sums_f64(const sph_boxes* arguments) { box_sums<double>(*arguments); }
-extern "C" void sph_neighbour_sums_f32(const sph_boxes* arguments) { neighbour_sums<float>(*arguments); }
-extern "C" void sph_neighbour_sums_f64(const sph_boxes* arguments) { neighbour_sums<double>(*arguments); }

@@ -40,14 +40,8 @@ class Backend(Protocol):
         """Sums (P,) of a real ``field`` (Z, Y, X) over the boxes of ``half`` widths around ``middle`` (P, 3)."""
         ...
 
-    def turn_gradient(self, turn: Tensor, half: tuple[int, int, int]) -> Callable[[Tensor], Tensor]:
-        """Change along each axis, rad per node, of how much echoes turn from one image to the next.
-
-        Returned as a function of nodes (P, 3), with values (P, 3). The turn is the phase of the lag-one
-        autocorrelation ``turn`` (Kasai et al., IEEE Trans. Sonics Ultrason. 32, 1985); its gradient is that of
-        neighbouring nodes against each other, averaged over twice the kernel: with only three numbers per
-        kernel taken from the data, little of the speckle's own phase gets into them.
-        """
+    def sums_around(self, field: Tensor, half: tuple[int, int, int]) -> Callable[[Tensor], Tensor]:
+        """Sums (P,) of a complex ``field`` (Z, Y, X), 0 outside, over boxes of ``half`` widths around nodes (P, 3)."""
         ...
 
     def correlate(

@@ -49,7 +49,7 @@ class _Boxes(ctypes.Structure):
     ]
 
 
-_STRUCTURES = {"correlate": _Correlation, "arrange": _Images, "box_sums": _Boxes, "neighbour_sums": _Boxes}
+_STRUCTURES = {"correlate": _Correlation, "arrange": _Images, "box_sums": _Boxes}
 
 
 def _call(name: str, dtype: torch.dtype, **arguments: object) -> None:
@@ -92,25 +92,16 @@ class CompiledBackend:
         return volume, power, turn
 
     def box_sums(self, field: Tensor, middle: Tensor, half: tuple[int, int, int]) -> Tensor:
-        field, middle = field.contiguous(), _nodes(middle, field.shape, half)
-        sums = field.new_empty(len(middle))
-        _call(
-            "box_sums", field.dtype, points=len(middle), shape=tuple(field.shape), reach=half, field=field,
-            middle=middle, out=sums,
-        )  # fmt: skip
+        return _box_sums(field.contiguous(), _nodes(middle, field.shape, half), half)
+
+    def sums_around(self, field: Tensor, half: tuple[int, int, int]) -> Callable[[Tensor], Tensor]:
+        parts = field.real.contiguous(), field.imag.contiguous()
+
+        def sums(middle: Tensor) -> Tensor:
+            nodes = _nodes(middle, field.shape)
+            return torch.complex(*(_box_sums(part, nodes, half) for part in parts))
+
         return sums
-
-    def turn_gradient(self, turn: Tensor, half: tuple[int, int, int]) -> Callable[[Tensor], Tensor]:
-        def gradient(middle: Tensor) -> Tensor:
-            nodes = _nodes(middle, turn.shape)
-            sums = turn.new_empty((len(nodes), 3))
-            _call(
-                "neighbour_sums", sums.real.dtype, points=len(nodes), shape=tuple(turn.shape),
-                reach=tuple(2 * h for h in half), field=turn, middle=nodes, out=sums,
-            )  # fmt: skip
-            return sums.angle()
-
-        return gradient
 
     def correlate(
         self, volume: Tensor, apart: int, corner: Tensor, offset: Tensor, shape: KernelShape,
@@ -129,6 +120,16 @@ class CompiledBackend:
             corner=corner, offset=offset, ramp=None if ramp is None else ramp.contiguous(), rho=rho,
         )  # fmt: skip
         return rho
+
+
+def _box_sums(field: Tensor, nodes: Tensor, half: tuple[int, int, int]) -> Tensor:
+    """Sums (P,) over the parts inside the volume of the boxes around ``nodes`` (P, 3)."""
+    sums = field.new_empty(len(nodes))
+    _call(
+        "box_sums", field.dtype, points=len(nodes), shape=tuple(field.shape), reach=half, field=field, middle=nodes,
+        out=sums,
+    )  # fmt: skip
+    return sums
 
 
 def _nodes(middle: Tensor, shape: torch.Size, reach: tuple[int, int, int] = (0, 0, 0)) -> Tensor:

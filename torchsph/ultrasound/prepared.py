@@ -23,8 +23,8 @@ class Prepared:
     A plane has a z axis of one node. volume (Z, Y, X, T); raw_power, power (Z, Y, X): mean squares over the
     images before and after the filter; spoilt (Z, Y, X): 1 where an image is not finite, ``None`` = nowhere.
     margin: nodes of padding. spacing (3,): m, 1 along an axis that is not there. noise: power of the thermal
-    noise after the filter, if known. turn_gradient: see :class:`Backend`, ``None`` = not asked for. active:
-    the axes that are there. backend: who does the sums.
+    noise after the filter, if known. turn: of the echoes from image to image, complex, around nodes (P, 3) of the
+    padded volume, ``None`` = not asked for. active: the axes that are there. backend: who does the sums.
     """
 
     packet: Packet
@@ -36,7 +36,7 @@ class Prepared:
     margin: tuple[int, int, int]
     spacing: Tensor
     noise: float | None
-    turn_gradient: Callable[[Tensor], Tensor] | None
+    turn: Callable[[Tensor], Tensor] | None
     active: tuple[int, ...]
     backend: Backend
 
@@ -63,8 +63,23 @@ class Prepared:
         return (torch.minimum(nodes + half, last) - (nodes - half).clamp_min(0) + 1).clamp_min(0)
 
     def ramp(self, nodes: Tensor) -> Tensor | None:
-        """Gradient (P, 3) of the echoes' turn, rad per node and image, at ``nodes`` (P, 3)."""
-        return None if self.turn_gradient is None else self.turn_gradient(self.middle(nodes))
+        """Gradient (P, 3), rad per node and image, of how much echoes turn, at ``nodes`` (P, 3).
+
+        The turn is the phase of the lag-one autocorrelation (Kasai et al., IEEE Trans. Sonics Ultrason. 32,
+        1985), averaged over twice the kernel: with few numbers taken from the data, little of the speckle's own
+        phase gets into them. Its change is that to half a kernel further on, either side; from node to node it
+        would be that of single speckles, whose nodes turn together whatever the shear.
+        """
+        if self.turn is None:
+            return None
+        middle, gradient = self.middle(nodes), self.power.new_zeros((len(nodes), 3))
+        here = self.turn(middle)
+        for axis in self.active:
+            step = torch.zeros_like(middle)
+            step[:, axis] = self.shape.half[axis]
+            change = self.turn(middle - step).conj() * here + here.conj() * self.turn(middle + step)
+            gradient[:, axis] = change.angle() / self.shape.half[axis]
+        return gradient
 
     def shear(self, ramp: Tensor | None, points: int) -> Tensor:
         """Size (points,), 1/s, of the gradient of the axial velocity; NaN where it was not asked for."""
@@ -134,5 +149,17 @@ def prepare(
         packet, shape, volume, after if clutter is None else padded(before), after, spoilt, margin,
         torch.tensor([1.0] * len(lead) + spacing, dtype=after.dtype, device=after.device),
         None if packet.noise is None else packet.noise * gain,
-        backend.turn_gradient(turn, shape.half) if follow_shear else None, tuple(range(len(lead), 3)), backend,
+        None if turn is None else _mean_turn(turn, after, shape.half, backend), tuple(range(len(lead), 3)), backend,
     )  # fmt: skip
+
+
+def _mean_turn(
+    turn: Tensor, power: Tensor, half: tuple[int, int, int], backend: Backend
+) -> Callable[[Tensor], Tensor]:
+    """Lag-one autocorrelation ``turn`` (Z, Y, X) averaged over twice the kernel, up to a factor.
+
+    Nodes weigh by amplitude instead of ``power``, so that neither the brightest speckle nor what is left of a
+    wall nearby speaks for all.
+    """
+    turn = turn / power.clamp_min(torch.finfo(power.dtype).tiny).sqrt()
+    return backend.sums_around(turn, tuple(2 * h for h in half))

@@ -36,16 +36,10 @@ class ReferenceBackend:
         blocks = gather(field[..., None], middle - middle.new_tensor(half), tuple(2 * h + 1 for h in half))
         return blocks.flatten(1).sum(1)
 
-    def turn_gradient(self, turn: Tensor, half: tuple[int, int, int]) -> Callable[[Tensor], Tensor]:
-        gradient = turn.real.new_zeros((*turn.shape, 3))
-        for axis in (axis for axis in range(3) if half[axis]):
-            # symmetric: a node with the next, and the one before with it
-            step = turn.roll(1, axis).conj() * turn
-            step = step + step.roll(-1, axis)
-            for other, h in enumerate(half):
-                step = box_sum(step, 4 * h + 1, other)
-            gradient[..., axis] = step.angle()
-        return lambda middle: gradient[middle.unbind(1)]
+    def sums_around(self, field: Tensor, half: tuple[int, int, int]) -> Callable[[Tensor], Tensor]:
+        for axis, h in enumerate(half):
+            field = box_sum(field, 2 * h + 1, axis)
+        return lambda middle: field[middle.unbind(1)]
 
     def correlate(
         self, volume: Tensor, apart: int, corner: Tensor, offset: Tensor, shape: KernelShape,
