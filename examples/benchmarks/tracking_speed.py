@@ -184,7 +184,7 @@ def main() -> None:
     for part in (phantom, rivals):
         results[part.__name__] = part(arguments.quick)
         for name, value in results[part.__name__].items():
-            print(f"{part.__name__:8s} {name:62s} {value:12.3f}", flush=True)
+            print(f"{part.__name__:8s} {name:62s} {value:12.4g}", flush=True)
     found = results["rivals"]
     for rival, least in (("plain SciPy, direct", 20.0), ("plain SciPy, fft", 20.0), ("OpenPIV", 1.0)):
         ratio = found.get(f"times as fast as {rival}")

@@ -13,7 +13,6 @@ from .compiled import CompiledBackend
 from .correlation import KernelShape
 from .reference import ReferenceBackend
 
-
 NAMES = ("auto", "cpu", "reference")
 
 
