@@ -26,6 +26,7 @@ from .assimilation import (
 )
 from .ensemble_options import EnsembleOptions
 from .innovation_spline import InnovationSpline, Look
+from .lagged import LaggedAnalyses
 from .members import Ensemble, Forecaster, Forecasts
 from .observing import Seen, Source
 from .perturbations import flow_perturbations
@@ -33,9 +34,6 @@ from .regions import flow_regions
 from .smooth import FrameSmoother
 from .solenoidal import without_divergence
 from .ultrasound.fields import fwhm_to_deviation
-
-# share of the forecast's error variance that an analysis leaves at least
-_LEAST_LEFT = 0.25
 
 
 class Cycle:
@@ -58,11 +56,12 @@ class Cycle:
         self.generator = torch.Generator().manual_seed(seed)
         self.augmentation = Augmentation(tuple(one.parameter for one in options.estimated))
         self.gain = LearnedGain(len(options.increments), self.grid.dimension, memory=options.memory)
-        self.spread = SpreadMatch()
+        self.spread = SpreadMatch(averaged=options.memory)
         self.first_group = np.cumsum([0] + [source.groups for source in self.sources]).tolist()
         self.scale = ErrorScale(self.first_group[-1], memory=options.memory)
         self.record = FilterRecord(seed=seed)
         self.spline = InnovationSpline(splines, options.choose_every)
+        self.lagged = None if options.lag is None else LaggedAnalyses(options.lag)
         self.offered: Tensor | None = None  # (J, D, *shape) increments of the last analysis
         self.fields: list[Tensor] = []
         self.sigmas: list[Tensor] = []
@@ -145,11 +144,15 @@ class Cycle:
         if int((~failed).sum()) < 2:  # too few to draw from: a new ensemble around the control
             fresh = self._perturbations(frame, self.usual)
             members = torch.stack([state.control + fresh for state in states], 1)
+            if self.lagged is not None:
+                self.lagged.clear()
             self.events.append({"time": time, "failed": torch.nonzero(failed).flatten().tolist(), "donor": "control"})
         else:
             repaired = replace_failed(members.flatten(1), failed, self.generator)
             members = repaired.ensemble.reshape(members.shape)
             self.events += [{"time": time, "failed": e.member, "donor": e.donor} for e in repaired.events]
+            for event in repaired.events if self.lagged is not None else ():
+                self.lagged.replaced(event.member, event.donor)
         return [replace(state, members=members[:, k]) for k, state in enumerate(states)]
 
     # --- observations ---------------------------------------------------------------------------------
@@ -196,6 +199,8 @@ class Cycle:
             joint, look.members, look.observations, state_positions=positions, generator=self.generator
         )
         self._record(analysis, look, forecast, inside, frame)
+        if self.lagged is not None:
+            self._improve_earlier(analysis, inside, size)
         weight = self._weights(analysis, look)
         if self.offered is not None:
             self.gain.learn(self._seen(self.offered, masks, look), torch.nan_to_num(analysis.innovation), weight)
@@ -205,7 +210,8 @@ class Cycle:
         self.scale.learn(analysis, look.observations, look.group)
         control = state.control + change
         anomalies, parameters = self._on_grid(analysis.ensemble[:, :size] - analysis.mean[:size], inside), {}
-        left = self._left(look, self._seen(anomalies, masks, look), self._seen(change[None], masks, look)[0], weight)
+        before, after = (float(part.double().var(0).sum()) for part in (forecast, analysis.ensemble[:, :size]))
+        left = self.spread.left(before, after, float(change[:, mask].double().square().sum()))
         anomalies = left * anomalies
         if state.parameters:
             _, parameters = self.augmentation.split(analysis.ensemble)
@@ -243,30 +249,22 @@ class Cycle:
             found.append(torch.diag_embed(whole.movedim(0, -1)).movedim((-2, -1), (0, 1)))
         return torch.cat(found)
 
-    def _left(self, look: Look, anomalies: Tensor, change: Tensor, weight: Tensor) -> float:
-        """Factor on the analysed anomalies, seen (N, m), that leaves them what the analysis left of the error.
-
-        With weights that make the innovations white the error's variance falls by the increment's own; the filter
-        believes that it did more, because it takes its own increment for the one that was followed.
-        """
-        before = float((weight * look.members.double().var(0)).nan_to_num().sum())
-        after = float((weight * anomalies.double().var(0)).sum())
-        taken = float((weight * change.double().square()).sum())
-        target = max(before - taken, _LEAST_LEFT * before)
-        return (target / after) ** 0.5 if after > 0 else 1.0
-
     def _match_spread(self, masks: list[Tensor], look: Look, weight: Tensor, frame: int) -> None:
-        """Compare what the spline finds in the innovations with what it finds in one draw from the ensemble."""
+        """Compare what the spline finds in the innovations with what it finds in one draw from the ensemble.
+
+        Every observation in use counts alike: the spread stands for the error of the whole state, most of which lies
+        where the observations are worst, in jets and shear.
+        """
         if "spline" not in self.options.increments:
             return
         parts, first = self.grid.dimension, self.options.increments.index("spline") * self.grid.dimension
-        seen = self._seen(self.offered, masks, look)
+        seen, used = self._seen(self.offered, masks, look), weight > 0
         followed = self.gain.weight @ seen
-        shown = float((weight * seen[first : first + parts].sum(0) * followed).sum())
+        shown = float((seen[first : first + parts].sum(0) * followed)[used].sum())
         draw = torch.randn(self.count, generator=self.generator, dtype=torch.float64) / (self.count - 1) ** 0.5
         anomaly = draw @ torch.nan_to_num(look.members - look.members.mean(0)).double()
         found = self.spline.of(anomaly, weight, look, frame, learning=True)
-        self.spread.learn(shown, float((weight * self._seen(found[None], masks, look)[0] * anomaly).sum()))
+        self.spread.learn(shown, float((self._seen(found[None], masks, look)[0] * anomaly)[used].sum()))
 
     def _coast(self, state: Ensemble, mask: Tensor, missing: int, time: float) -> None:
         """Nothing was measured: the forecast is the analysis."""
@@ -296,11 +294,21 @@ class Cycle:
         return full.reshape(len(values), self.grid.dimension, *self.grid.shape)
 
     def _keep(self, control: Tensor, sigma: Tensor, missing: int) -> None:
-        mask = np.array(self.measured.mask[len(self.fields)], bool)
-        clean = without_divergence(control.numpy(), mask, self.grid.spacing)
-        self.fields.append(torch.from_numpy(clean).to(torch.float32))
+        if self.lagged is not None:
+            self.lagged.add(self.done, control, self.ensemble.members - self.ensemble.control, sigma)
+        self.fields.append(self._clean(control, self.done))
         self.sigmas.append(sigma.to(torch.float32))
         self.missing.append(missing)
+
+    def _improve_earlier(self, analysis: Analysis, inside: Tensor, numbers: int) -> None:
+        for one in self.lagged.improve(analysis, inside, numbers):
+            mask = self.mask(one.frame)
+            self.fields[one.frame] = self._clean(torch.where(mask, one.control, 0.0), one.frame)
+            self.sigmas[one.frame] = one.sigma
+
+    def _clean(self, control: Tensor, frame: int) -> Tensor:
+        mask = np.array(self.measured.mask[frame], bool)
+        return torch.from_numpy(without_divergence(control.numpy(), mask, self.grid.spacing)).to(torch.float32)
 
     def state(self) -> dict[str, Any]:
         """Everything that the next step depends on, as tensors and plain values."""
@@ -311,6 +319,7 @@ class Cycle:
             "scale": self.scale.state(), "record": self.record.state(), "spline": self.spline.state(),
             "offered": self.offered, "fields": list(self.fields), "sigmas": list(self.sigmas),
             "missing": list(self.missing), "events": list(self.events),
+            "lagged": [] if self.lagged is None else self.lagged.state(),
         }  # fmt: skip
 
     def restore(self, state: dict[str, Any]) -> None:
@@ -321,6 +330,8 @@ class Cycle:
         self.offered = state["offered"]
         self.fields, self.sigmas = list(state["fields"]), list(state["sigmas"])
         self.missing, self.events = list(state["missing"]), list(state["events"])
+        if self.lagged is not None:
+            self.lagged.restore(state["lagged"])
 
 
 def _nearest(times: list[float], time: float) -> int:
