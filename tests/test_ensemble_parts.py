@@ -225,16 +225,23 @@ def test_removing_divergence_is_a_projection():
     mask, spacing = x**2 + y**2 + z**2 < 0.8, (1e-3,) * 3
     potential = np.sin(3 * x) * np.cos(2 * y) * np.cos(z)
     turning = np.stack([np.gradient(potential, 1e-3, axis=1), -np.gradient(potential, 1e-3, axis=2), 0 * x])
-    kept = without_divergence(turning, mask, spacing)
+    kept = without_divergence(turning, mask, spacing).velocity
     np.testing.assert_allclose(kept[:, mask], turning[:, mask], atol=1e-6 * np.abs(turning).max())
     field = turning + 40.0 * np.stack([x * y, x - y**2, z * x])
-    clean = without_divergence(field, mask, spacing)
+    found = without_divergence(field, mask, spacing)
+    clean = found.velocity
+    assert found.converged
     before, after = (divergence_rms(f[None], mask[None], spacing).value for f in (field, clean))
     assert after < 0.12 * before
+    assert found.left == pytest.approx(after / before, rel=1e-3)
     assert np.abs(clean[:, ~mask]).max() == 0.0
     # of all fields without divergence it is the nearest: the change is orthogonal to what is left of it
     change, kept = (field - clean)[:, mask], turning[:, mask]
     assert abs(float((change * kept).sum())) < 1e-3 * np.linalg.norm(change) * np.linalg.norm(kept)
+    # too few iterations are told; a result that is no better than nothing is not taken
+    short = without_divergence(field, mask, spacing, reduction=1e-6, iterations=1)
+    assert not short.converged and short.left == 1.0
+    np.testing.assert_array_equal(short.velocity, field)
 
 
 def test_regions_of_a_ventricle(measured):

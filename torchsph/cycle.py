@@ -308,7 +308,10 @@ class Cycle:
 
     def _clean(self, control: Tensor, frame: int) -> Tensor:
         mask = np.array(self.measured.mask[frame], bool)
-        return torch.from_numpy(without_divergence(control.numpy(), mask, self.grid.spacing)).to(torch.float32)
+        found = without_divergence(control.numpy(), mask, self.grid.spacing)
+        if not found.converged:
+            self.events.append({"time": float(self.measured.time[frame]), "divergence_left": found.left})
+        return torch.from_numpy(found.velocity).to(torch.float32)
 
     def state(self) -> dict[str, Any]:
         """Everything that the next step depends on, as tensors and plain values."""
