@@ -63,6 +63,8 @@ _OBJECTS = (
     _Object("pairs.cpp", "pairs_f32", ("-DSPH_REAL=float", "-DSPH_SUFFIX=_f32")),
     _Object("pairs.cpp", "pairs_f64", ("-DSPH_REAL=double", "-DSPH_SUFFIX=_f64")),
     _Object("closest.cpp", "closest", ()),
+    _Object("correlation.cpp", "correlation", ()),
+    _Object("images.cpp", "images", ()),
     _Object("look_up.cpp", "look_up", ()),
     _Object("machine.cpp", "machine", ()),
     _Object("walls.cpp", "walls", ()),

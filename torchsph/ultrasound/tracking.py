@@ -15,8 +15,9 @@ import torch
 from torch import Tensor
 
 from .acquisition import Acquisition, Packet, decibel
+from .backends import backend
 from .clutter import ClutterFilter, FIRFilter
-from .correlation import ImagePairs, KernelShape
+from .correlation import KernelShape
 from .estimates import Estimates, Flag, bit
 from .gates import gates
 from .motion import Motion, find_motion
@@ -46,7 +47,8 @@ class SpeckleTracker:
     min_correlation: least correlation; lone_correlation: the same where no longer lag confirms the first,
         whose axial phase may then be a whole turn off. Both are of the echoes without their noise: where that
         is known, echoes that make up a share s of the power need s times as much, but at least 0.5.
-    tile: points correlated at a time, which bounds memory.
+    tile: points worked on at a time, which bounds memory.
+    backend: who does the sums: "cpu", compiled code, "reference", torch on any device, or "auto".
     """
 
     kernel: float = 1e-3
@@ -62,7 +64,8 @@ class SpeckleTracker:
     min_response: float | None = -12.0
     min_correlation: float = 0.8
     lone_correlation: float = 0.9
-    tile: int = 32
+    tile: int = 512
+    backend: str = "auto"
 
     def __post_init__(self) -> None:
         for name in ("kernel", "search"):
@@ -87,28 +90,26 @@ def track(packet: Packet, points: Tensor, options: SpeckleTracker) -> Estimates:
         packet, options.clutter, kernel=options.kernel, min_samples=options.min_samples,
         reach=options.search * packet.acquisition.interval * options.lags[0],
         least_images=1 + options.lags[0], follow_shear=options.follow_shear,
+        backend=backend(options.backend, packet.iq.device),
     )  # fmt: skip
     nodes, beam = images.nearest_nodes(points), images.directions(points)
-    pairs = [images.pairs(lag) for lag in options.lags if lag < images.volume.shape[-1]]
     starts = range(0, max(len(points), 1), options.tile)
     tiles = [slice(start, start + options.tile) for start in starts]
-    return Estimates.joined([_track_tile(images, pairs, nodes[tile], beam[tile], options) for tile in tiles])
+    return Estimates.joined([_track_tile(images, nodes[tile], beam[tile], options) for tile in tiles])
 
 
-def _track_tile(
-    images: Prepared, pairs: list[ImagePairs], nodes: Tensor, beam: Tensor, options: SpeckleTracker
-) -> Estimates:
+def _track_tile(images: Prepared, nodes: Tensor, beam: Tensor, options: SpeckleTracker) -> Estimates:
     """Estimates at a tile of nodes (P, 3); only those that pass the gates are correlated."""
-    corner = images.corner(nodes)
     snr, share, flags = gates(
-        images, corner,
+        images, nodes,
         min_samples=options.min_samples, min_blood=options.min_blood, min_snr=options.min_snr,
         max_snr=options.max_snr,
     )  # fmt: skip
     axes = list(reversed(images.active))
     packet, interval = images.packet, images.packet.acquisition.interval
     kept = torch.nonzero(flags == 0)[:, 0]
-    motion = _follow(images, pairs, nodes[kept], beam[kept], options)
+    ramp = images.ramp(nodes)
+    motion = _follow(images, nodes[kept], beam[kept], None if ramp is None else ramp[kept], options)
     velocity = motion.shift[:, axes] / interval
     response = _response((motion.shift * beam[kept]).sum(1), packet.acquisition, options.clutter)
     flags[kept] = _doubts(velocity, motion, snr[kept], response, options)
@@ -121,26 +122,27 @@ def _track_tile(
         peak_ratio=spread(motion.peak_ratio, 1.0), curvature=spread(motion.curvature[:, axes], 0.0),
         # of what was not correlated nothing is known but that it is within the range
         variance=spread(motion.variance[:, axes] / interval**2, options.search**2),
-        power=share, snr=snr, response=spread(response, 0.0), shear=images.shear(corner),
-        lag=spread(motion.lag, pairs[0].apart), flags=flags,
+        power=share, snr=snr, response=spread(response, 0.0), shear=images.shear(ramp, len(nodes)),
+        lag=spread(motion.lag, options.lags[0]), flags=flags,
     )  # fmt: skip
 
 
 def _follow(
-    images: Prepared, pairs: list[ImagePairs], nodes: Tensor, beam: Tensor, options: SpeckleTracker
+    images: Prepared, nodes: Tensor, beam: Tensor, ramp: Tensor | None, options: SpeckleTracker
 ) -> Motion:
     """The first lag searched over the whole range, each further one around what is known by then."""
     corner, wide = images.corner(nodes), images.shape
     motion = find_motion(
-        images, pairs[0], corner, torch.zeros_like(nodes), wide, beam, prior=None, phase=options.phase
-    )
+        images, options.lags[0], corner, torch.zeros_like(nodes), wide, beam,
+        ramp=ramp, prior=None, phase=options.phase,
+    )  # fmt: skip
     narrow = KernelShape(wide.half, tuple(min(s, 1) for s in wide.search))
-    for later in pairs[1:]:
-        offset = (motion.shift * later.apart / images.spacing).round().long()
+    for lag in (lag for lag in options.lags[1:] if lag < images.volume.shape[-1]):
+        offset = (motion.shift * lag / images.spacing).round().long()
         fits = images.holds(nodes + offset)
         offset = torch.where(fits[:, None], offset, 0)
         found = find_motion(
-            images, later, corner, offset, narrow, beam, prior=motion, phase=options.phase
+            images, lag, corner, offset, narrow, beam, ramp=ramp, prior=motion, phase=options.phase
         )
         motion = motion.better(found, fits)
     return motion
