@@ -9,8 +9,9 @@ import torch
 
 import geometry
 from regularize import Smoother
-from torchsph.assimilation import AssimilationError, LearnedGain, Reason, SpreadMatch
+from torchsph.assimilation import ETKF, AssimilationError, LearnedGain, Observations, Reason, SpreadMatch
 from torchsph.data import sample_measurement
+from torchsph.lagged import LaggedAnalyses
 from torchsph.members import shares
 from torchsph.metrics import divergence_rms, spread_over_skill
 from torchsph.observation_error import ObservationError
@@ -73,6 +74,24 @@ def test_a_useless_increment_is_ignored_and_a_checkpoint_goes_on():
         gain.learn(offered, left[1:], torch.ones(2000))
     with pytest.raises(AssimilationError, match="LearnedGain needs"):
         LearnedGain(0)
+
+
+def test_a_lagged_analysis_is_the_kalman_smoother_of_a_linear_model():
+    """Random walk of two numbers: the state before the last, given all data, against the closed form."""
+    draw, count = torch.Generator().manual_seed(0), 500
+    prior, forcing, noise = 1.0, 0.5, 0.7
+    members = prior**0.5 * torch.randn(count, 2, generator=draw, dtype=torch.float64)
+    later = members + forcing**0.5 * torch.randn(count, 2, generator=draw, dtype=torch.float64)
+    seen = torch.tensor([1.3, -0.4], dtype=torch.float64)
+    analysis = ETKF().analyse(later, later, Observations(seen, torch.full((2,), noise, dtype=torch.float64)))
+    past = LaggedAnalyses(1)
+    deviation = members.std(0).reshape(2, 1)
+    past.add(0, members.mean(0).reshape(2, 1), members.reshape(count, 2, 1), deviation)
+    (found,) = past.improve(analysis, torch.tensor([0]), 2)
+    gain = prior / (prior + forcing + noise)
+    np.testing.assert_allclose(found.control[:, 0], gain * seen, atol=0.15)  # 500 members know their mean to 0.05
+    np.testing.assert_allclose(found.sigma[:, 0], (prior - gain * prior) ** 0.5, rtol=0.1)
+    assert past.kept.maxlen == 1
 
 
 def run_twin(forcing: float, noise: float, stated: float, cycles: int = 60) -> list[tuple[float, float]]:

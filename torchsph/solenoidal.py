@@ -8,7 +8,6 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import cg
 
-
 # a result that misses the reduction asked for by more than this factor is not taken
 _ENOUGH = 3.0
 
