@@ -87,11 +87,13 @@ def test_a_lagged_analysis_is_the_kalman_smoother_of_a_linear_model():
     past = LaggedAnalyses(1)
     deviation = members.std(0).reshape(2, 1)
     past.add(0, members.mean(0).reshape(2, 1), members.reshape(count, 2, 1), deviation)
-    (found,) = past.improve(analysis, torch.tensor([0]), 2)
+    (found,) = past.improved(analysis, torch.tensor([0]), 2)
     gain = prior / (prior + forcing + noise)
     np.testing.assert_allclose(found.control[:, 0], gain * seen, atol=0.15)  # 500 members know their mean to 0.05
     np.testing.assert_allclose(found.sigma[:, 0], (prior - gain * prior) ** 0.5, rtol=0.1)
-    assert past.kept.maxlen == 1
+    past.take([found])
+    past.replaced(3, 7)
+    assert torch.equal(past.kept[0].anomalies[3], past.kept[0].anomalies[7])
 
 
 def run_twin(forcing: float, noise: float, stated: float, cycles: int = 60) -> list[tuple[float, float]]:

@@ -36,16 +36,18 @@ class LaggedAnalyses:
     def add(self, frame: int, control: Tensor, anomalies: Tensor, sigma: Tensor) -> None:
         self.kept.append(Lagged(frame, control, anomalies - anomalies.mean(0), sigma))
 
-    def improve(self, analysis: Analysis, inside: Tensor, numbers: int) -> list[Lagged]:
-        """All that are kept, by what ``analysis`` learned.
+    def improved(self, analysis: Analysis, inside: Tensor, numbers: int) -> list[Lagged]:
+        """All that are kept as ``analysis`` improves them; ``take`` makes them the ones that are kept.
 
         Args:
             inside: (q,) nodes of the analysis. numbers: of its state that stand for them, D q; what follows them are
                 parameters, which earlier states do not hold. Nodes that have left the blood since stay as they are.
         """
         size = analysis.ensemble.shape[1]
-        self.kept = deque((_improved(one, analysis, inside, numbers, size) for one in self.kept), self.kept.maxlen)
-        return list(self.kept)
+        return [_improved(one, analysis, inside, numbers, size) for one in self.kept]
+
+    def take(self, improved: list[Lagged]) -> None:
+        self.kept = deque(improved, self.kept.maxlen)
 
     def replaced(self, member: int, donor: int) -> None:
         """A failed member goes on as another: so does its past."""

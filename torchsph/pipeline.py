@@ -16,7 +16,7 @@ from .ensemble_options import EnsembleOptions
 from .forecast import ForecastSkill, skill
 from .free_run import run_freely
 from .observation_error import estimate_error
-from .parallel import is_lead
+from .parallel import from_last, is_last, is_lead
 from .particle_filter import filter_sph
 from .presets import preset as scheme_preset
 from .scene import Scene
@@ -67,7 +67,8 @@ def run_methods(
     (``assimilate``, ``EnsembleOptions``); the other methods know one measurement. The seconds of a method include the
     spline that it starts from only where "spline" itself was not asked for.
 
-    Under torchrun the processes beside the first take part in the ensemble alone, and return nothing else.
+    Under torchrun all processes share the splines and the ensemble; the first one runs "sph" meanwhile and the last
+    one "free". What the first one returns is complete.
 
     Raises ValueError for an unknown method, and for "sph" on a measurement along a beam.
     """
@@ -76,8 +77,6 @@ def run_methods(
         raise ValueError(f"unknown method {', '.join(unknown)}; known: {', '.join(METHODS)}")
     if "sph" in methods and measured.beam is not None:
         raise ValueError("method sph imposes full vectors and the measurement holds one component along a beam")
-    if not is_lead():
-        methods = [name for name in methods if name == "ensemble"]
     if not methods:
         return {}
     smoother = make_smoother(preset)
@@ -89,10 +88,10 @@ def run_methods(
         results["spline"] = timer.result(smoothed, {"smoother": repr(smoother)})
     spacing = ANALYSIS_SPACING * min(measured.grid.spacing) if spacing is None else spacing
     model = make_model(measured, preset=preset, spacing=spacing, device=device)
-    if is_lead() and set(methods) != {"spline"}:
+    if is_last() and set(methods) != {"spline"}:
         free = run_freely(measured, model, smoothed.velocity[0], seed=seed, progress=progress)
         results["free"] = timer.result(free, {})
-    if "sph" in methods:
+    if is_lead() and "sph" in methods:
         error = estimate_error(measured, splines, smoothed)
         run = filter_sph(measured, model, error=error, seed=seed, progress=progress)
         results["sph"] = timer.result(run.recording, run.info)
@@ -104,6 +103,8 @@ def run_methods(
             seed=seed, progress=progress,
         )
         results["ensemble"] = timer.result(many.recording, many.info)
+    free = from_last(results.get("free"))
+    results |= {} if free is None else {"free": free}
     return {name: results[name] for name in METHODS if name in results}
 
 

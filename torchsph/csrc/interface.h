@@ -145,6 +145,17 @@ typedef struct { /* sums of a real field over boxes around points; see images.cp
   void* out;                  /* (points,) */
 } sph_boxes;
 
+typedef struct { /* points and a periodic lattice; see gridding.cpp */
+  int32_t threads, dimension, width;
+  double shape_parameter;
+  double origin[3], spacing[3]; /* along x, y, z */
+  int64_t counts[3];            /* nodes, at least `width` */
+  int64_t points;
+  const void* position;         /* (points, dimension) */
+  void* values;                 /* (points,) complex */
+  void* field;                  /* (.., y, x) complex; spread: added to */
+} sph_gridding;
+
 #ifdef __cplusplus
 extern "C" {
 #endif
@@ -173,6 +184,10 @@ void sph_arrange_f32(const sph_images*);
 void sph_arrange_f64(const sph_images*);
 void sph_box_sums_f32(const sph_boxes*);
 void sph_box_sums_f64(const sph_boxes*);
+void sph_spread_f32(const sph_gridding*);
+void sph_spread_f64(const sph_gridding*);
+void sph_gather_f32(const sph_gridding*);
+void sph_gather_f64(const sph_gridding*);
 void sph_grid_closest(const sph_closest*);
 int sph_runs(const char* instruction_set);             /* whether this processor has it */
 double sph_fma(int threads, int64_t turns, float factor); /* float32 multiply-adds; the flop done */

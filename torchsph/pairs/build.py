@@ -64,6 +64,7 @@ _OBJECTS = (
     _Object("pairs.cpp", "pairs_f64", ("-DSPH_REAL=double", "-DSPH_SUFFIX=_f64")),
     _Object("closest.cpp", "closest", ()),
     _Object("correlation.cpp", "correlation", ()),
+    _Object("gridding.cpp", "gridding", ()),
     _Object("images.cpp", "images", ()),
     _Object("look_up.cpp", "look_up", ()),
     _Object("machine.cpp", "machine", ()),
