@@ -69,6 +69,7 @@ def assert_same(one, other):
     np.testing.assert_array_equal(one.recording.velocity, other.recording.velocity)
     np.testing.assert_array_equal(one.recording.sigma, other.recording.sigma)
     assert one.info["filter"] == other.info["filter"]
+    assert one.info["shocks"] == other.info["shocks"]
 
 
 class Stopped(RuntimeError):
@@ -90,6 +91,8 @@ def test_a_restart_in_the_middle_changes_no_bit(given, plain, tmp_path, monkeypa
     with pytest.raises(ValueError, match="belongs to a run with other"):
         given.run(checkpoints=path, resume=True, seed=2)
     assert_same(given.run(checkpoints=path, resume=True), plain)
+    assert [shock["time"] for shock in plain.info["shocks"]] == given.measured.time[:-1].tolist()
+    assert all(0 < shock["shock"] < 0.3 for shock in plain.info["shocks"])
     assert [file.name for file in tmp_path.iterdir()] == ["checkpoint.pt"]
 
 

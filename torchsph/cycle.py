@@ -72,6 +72,7 @@ class Cycle:
         self.sigmas: list[Tensor] = []
         self.missing: list[int] = []
         self.events: list[dict[str, Any]] = []
+        self.shocks: list[float] = []
         self.ensemble: Ensemble | None = None
 
     @property
@@ -112,6 +113,7 @@ class Cycle:
         generator = self._forked()
         noise = self._perturbations(frame, 1.0, generator) if is_last() and self.options.model_error > 0 else None
         forecasts = self.forecaster.advance(self.ensemble, before, early, times, masks)
+        self.shocks.append(forecasts.shock)
         states = self._prepared(forecasts, from_last(noise), frame)
         look = self._look([(source, what, _nearest(times, time)) for source, what, time in seen], states, masks)
         missing = int((late & ~forecasts.covered).sum())
@@ -360,7 +362,7 @@ class Cycle:
             "generator": self.generator.get_state(), "gain": self.gain.state(), "spread": self.spread.state(),
             "scale": self.scale.state(), "record": self.record.state(), "spline": self.spline.state(),
             "offered": self.offered, "fields": list(self.fields), "sigmas": list(self.sigmas),
-            "missing": list(self.missing), "events": list(self.events),
+            "missing": list(self.missing), "events": list(self.events), "shocks": list(self.shocks),
             "lagged": [] if self.lagged is None else self.lagged.state(),
         }  # fmt: skip
 
@@ -371,7 +373,7 @@ class Cycle:
             getattr(self, name).restore(state[name])
         self.offered = state["offered"]
         self.fields, self.sigmas = list(state["fields"]), list(state["sigmas"])
-        self.missing, self.events = list(state["missing"]), list(state["events"])
+        self.missing, self.events, self.shocks = (list(state[name]) for name in ("missing", "events", "shocks"))
         if self.lagged is not None:
             self.lagged.restore(state["lagged"])
 
