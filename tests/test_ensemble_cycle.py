@@ -96,6 +96,31 @@ def test_a_restart_in_the_middle_changes_no_bit(given, plain, tmp_path, monkeypa
     assert [file.name for file in tmp_path.iterdir()] == ["checkpoint.pt"]
 
 
+def test_later_frames_improve_earlier_analyses_alone(given, plain, tmp_path, monkeypatch):
+    """The last analysis and all forecasts stay; earlier ones come nearer to the next data; a restart changes no bit."""
+    options = EnsembleOptions(batch=2, lag=2)
+    late = given.run(options=options)
+    np.testing.assert_array_equal(late.recording.velocity[-1], plain.recording.velocity[-1])
+    assert late.info["filter"] == plain.info["filter"]
+    inside = np.asarray(given.measured.mask, bool)[:-1]
+    moved, sure, known = (np.moveaxis(part[:-1], 1, -1)[inside] for part in (
+        late.recording.velocity - plain.recording.velocity, late.recording.sigma, plain.recording.sigma
+    ))  # fmt: skip
+    assert 0 < np.square(moved).mean() < np.square(known).mean()
+    assert np.square(sure).mean() < np.square(known).mean()
+
+    def stopping(self, frame, step=Cycle.step):
+        if frame == 2:
+            raise Stopped
+        step(self, frame)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Cycle, "step", stopping)
+        with pytest.raises(Stopped):
+            given.run(options=options, checkpoints=tmp_path / "late.pt")
+    assert_same(given.run(options=options, checkpoints=tmp_path / "late.pt", resume=True), late)
+
+
 def take_part(rank: int, processes: int, folder: str) -> None:
     dist.init_process_group("gloo", init_method=f"file://{folder}/meet", rank=rank, world_size=processes)
     torch.set_num_threads(1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -165,8 +166,15 @@ def _accounts(cycle: Cycle) -> dict[str, Any]:
         name: {"mean": float(row.mean()), "deviation": float(row.std())}
         for name, row in cycle.ensemble.parameters.items()
     }
+    divergent = [event["divergence_left"] for event in cycle.events if "divergence_left" in event]
+    if divergent:
+        warnings.warn(
+            f"removing the divergence did not converge in {len(divergent)} analyses (of the divergence up to "
+            f"{max(divergent):.2g} is left); 1 means that the field was left alone", RuntimeWarning, stacklevel=3,
+        )
     return {
         "members": cycle.count, "replaced_members": replaced, "events": cycle.events, "shocks": _shocks(cycle),
+        "divergence_not_converged": len(divergent),
         "coasted_frames": sum(1 for event in cycle.events if "coasted" in event),
         "gain": dict(zip(cycle.options.increments, weights, strict=True)), "spread_factor": cycle.spread.factor,
         "observation_error_scale": cycle.scale.factor.tolist(), "kernel": [one.kernel for one in cycle.sources],

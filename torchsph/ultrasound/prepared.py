@@ -67,8 +67,9 @@ class Prepared:
 
         The turn is the phase of the lag-one autocorrelation (Kasai et al., IEEE Trans. Sonics Ultrason. 32,
         1985), averaged over twice the kernel: with few numbers taken from the data, little of the speckle's own
-        phase gets into them. Its change is that to half a kernel further on, either side; from node to node it
-        would be that of single speckles, whose nodes turn together whatever the shear.
+        phase gets into them. Nodes weigh by amplitude instead of power, so that neither the brightest speckle nor
+        what is left of a wall nearby speaks for all. Its change is that to half a kernel further on, either side;
+        from node to node it would be that of single speckles, whose nodes turn together whatever the shear.
         """
         if self.turn is None:
             return None
@@ -149,17 +150,6 @@ def prepare(
         packet, shape, volume, after if clutter is None else padded(before), after, spoilt, margin,
         torch.tensor([1.0] * len(lead) + spacing, dtype=after.dtype, device=after.device),
         None if packet.noise is None else packet.noise * gain,
-        None if turn is None else _mean_turn(turn, after, shape.half, backend), tuple(range(len(lead), 3)), backend,
+        None if turn is None else backend.sums_around(turn, tuple(2 * h for h in shape.half)),
+        tuple(range(len(lead), 3)), backend,
     )  # fmt: skip
-
-
-def _mean_turn(
-    turn: Tensor, power: Tensor, half: tuple[int, int, int], backend: Backend
-) -> Callable[[Tensor], Tensor]:
-    """Lag-one autocorrelation ``turn`` (Z, Y, X) averaged over twice the kernel, up to a factor.
-
-    Nodes weigh by amplitude instead of ``power``, so that neither the brightest speckle nor what is left of a
-    wall nearby speaks for all.
-    """
-    turn = turn / power.clamp_min(torch.finfo(power.dtype).tiny).sqrt()
-    return backend.sums_around(turn, tuple(2 * h for h in half))
