@@ -18,7 +18,8 @@ class Estimated:
     """A parameter of the simulator that the members disagree about and the filter learns.
 
     Attributes:
-        parameter: its name is one of ``Simulation.change``'s ("viscosity", "sound_speed", ...), with its bounds.
+        parameter: its name is one of ``Simulation.change``'s ("viscosity", "sound_speed", "valve_strength", ...), with
+            its bounds.
         value: first guess. spread: standard deviation of the first guess in the parameter's unbounded coordinate (its
             logarithm above a lower bound).
     """

@@ -102,7 +102,7 @@ class Simulation:
             self._sort(self._order)
         longest = self._longest_step(until)
         for stop in self.domain.breaks(self.time, until):
-            self.domain.enter(self.time, stop)
+            self.domain.enter(self.time, stop, valve_strength=self.parameters.valve_strength)
             self.particles = self.domain.prepare(self.particles)
             self._forget_pairs()
             self._advance_interval(stop, longest)
@@ -129,12 +129,14 @@ class Simulation:
         where the scheme has no place for it.
         """
         scheme = self.simulator.scheme
-        changeable = ("shifting", "courant", "viscosity")
+        changeable = ("shifting", "courant", "viscosity", "valve_strength")
         if isinstance(scheme, Projection) and not set(values) <= set(changeable):
             known = ", ".join(changeable)
             raise ValueError(f"of the incompressible scheme only {known} can change, got {list(values)}")
         if values.get("xsph") is not None and scheme.xsph is None:
             raise ValueError("parameter 'xsph' needs a scheme with XSPH, which says of what level and form it is")
+        if "valve_strength" in values and self.domain.sources is None and self._pressures is None:
+            raise ValueError("parameter 'valve_strength' needs pressure sources or valves that are given a pressure")
         complete = self.domain.walls is not None and isinstance(scheme.wall, CompleteKernelWall)
         if "smoothing_ratio" in values and complete:
             raise ValueError("the tables of a complete-kernel wall are made for the scheme's smoothing_ratio")
