@@ -108,6 +108,18 @@ def test_shear_is_told_to_some_per_cent(gradient):
     assert float(found.shear.median()) == pytest.approx(math.hypot(*gradient), rel=0.15)
 
 
+def test_what_shear_leaves_of_the_correlation_is_believed():
+    """150/s leaves exp(-(0.25 ms 150/s k s)^2 / 4) = 0.86, k the phase per metre and s = 0.51 mm: below either gate."""
+    gradient = ((0, 0, 0), (0, 0, 0), (150.0, 0, 0))
+    scene, points = packet((0.2, 0.1, 0.2), gradient=gradient), lattice()
+    found = PLAIN.track(scene, points)
+    true = torch.tensor([0.2, 0.1, 0.2]) + torch.outer(points[:, 0].float(), torch.tensor([0, 0, 150.0]))
+    error = found.velocity - true
+    assert float(found.correlation.median()) == pytest.approx(0.86 / 1.01, abs=0.02)
+    assert found.accepted.float().mean() > 0.9 and (found.lag == 1).float().mean() > 0.9
+    assert error[found.accepted][:, 2].std() < 0.012 and error[found.accepted][:, :2].std() < 0.15
+
+
 # hard cases
 
 
