@@ -69,6 +69,7 @@ def assert_same(one, other):
     np.testing.assert_array_equal(one.recording.velocity, other.recording.velocity)
     np.testing.assert_array_equal(one.recording.sigma, other.recording.sigma)
     assert one.info["filter"] == other.info["filter"]
+    assert one.info["shocks"] == other.info["shocks"]
 
 
 class Stopped(RuntimeError):
@@ -90,7 +91,34 @@ def test_a_restart_in_the_middle_changes_no_bit(given, plain, tmp_path, monkeypa
     with pytest.raises(ValueError, match="belongs to a run with other"):
         given.run(checkpoints=path, resume=True, seed=2)
     assert_same(given.run(checkpoints=path, resume=True), plain)
+    assert [shock["time"] for shock in plain.info["shocks"]] == given.measured.time[:-1].tolist()
+    assert all(0 < shock["shock"] < 0.3 for shock in plain.info["shocks"])
     assert [file.name for file in tmp_path.iterdir()] == ["checkpoint.pt"]
+
+
+def test_later_frames_improve_earlier_analyses_alone(given, plain, tmp_path, monkeypatch):
+    """The last analysis and all forecasts stay; earlier ones come nearer to the next data; a restart changes no bit."""
+    options = EnsembleOptions(batch=2, lag=2)
+    late = given.run(options=options)
+    np.testing.assert_array_equal(late.recording.velocity[-1], plain.recording.velocity[-1])
+    assert late.info["filter"] == plain.info["filter"]
+    inside = np.asarray(given.measured.mask, bool)[:-1]
+    moved, sure, known = (np.moveaxis(part[:-1], 1, -1)[inside] for part in (
+        late.recording.velocity - plain.recording.velocity, late.recording.sigma, plain.recording.sigma
+    ))  # fmt: skip
+    assert 0 < np.square(moved).mean() < np.square(known).mean()
+    assert np.square(sure).mean() < np.square(known).mean()
+
+    def stopping(self, frame, step=Cycle.step):
+        if frame == 2:
+            raise Stopped
+        step(self, frame)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Cycle, "step", stopping)
+        with pytest.raises(Stopped):
+            given.run(options=options, checkpoints=tmp_path / "late.pt")
+    assert_same(given.run(options=options, checkpoints=tmp_path / "late.pt", resume=True), late)
 
 
 def take_part(rank: int, processes: int, folder: str) -> None:

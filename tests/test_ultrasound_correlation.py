@@ -7,6 +7,7 @@ import torch
 from torchsph.pairs.native import LibraryMissing, library
 from torchsph.ultrasound import backends
 from torchsph.ultrasound.correlation import KernelShape
+from torchsph.ultrasound.gridding import Gridding
 from torchsph.ultrasound.peak import find_peak
 
 try:
@@ -68,6 +69,23 @@ def test_compiled_sums_over_images_and_boxes_are_those_of_torch(dtype, close):
         ])  # fmt: skip
     for compiled, reference in zip(found[1], found[0], strict=True):
         torch.testing.assert_close(compiled, reference, atol=close, rtol=close)
+
+
+@pytest.mark.skipif(not COMPILED, reason="no C++ compiler: torch decides how its sums are split")
+def test_the_number_of_threads_changes_nothing():
+    sums, volume = backends.backend("cpu"), random_volume(dtype=torch.float32)
+    generator = torch.Generator().manual_seed(2)
+    corner, shape = torch.randint(4, 9, (40, 3), generator=generator), KernelShape((1,) * 3, (2,) * 3)
+    lattice, points = Gridding((0.0,) * 3, (1.0,) * 3, (9, 10, 11)), 12 * torch.rand((300, 3), generator=generator)
+    found, threads = [], torch.get_num_threads()
+    try:
+        for number in (1, 3):
+            torch.set_num_threads(number)
+            spread = lattice.spread(points, torch.polar(points[:, 0], points[:, 1]))
+            found.append([sums.correlate(volume, 1, corner, torch.zeros_like(corner), shape), spread])
+    finally:
+        torch.set_num_threads(threads)
+    assert all(torch.equal(one, three) for one, three in zip(*found, strict=True))
 
 
 def test_what_was_asked_for_by_name_and_is_missing_is_an_error(monkeypatch):

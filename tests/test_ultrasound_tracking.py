@@ -253,6 +253,7 @@ def test_options_are_checked():
         ({"kernel": 0.0}, "kernel"),
         ({"lags": (2, 1)}, "lags"),
         ({"min_samples": 1}, "min_samples"),
+        ({"backend": "gpu"}, "backend"),
     ):
         with pytest.raises(ValueError, match=message):
             SpeckleTracker(**options)

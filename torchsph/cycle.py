@@ -27,6 +27,7 @@ from .assimilation import (
 )
 from .ensemble_options import EnsembleOptions
 from .innovation_spline import InnovationSpline, Look
+from .lagged import Lagged, LaggedAnalyses
 from .members import Ensemble, Forecaster, Forecasts
 from .observing import Seen, Source
 from .parallel import from_last, is_last, shared
@@ -36,8 +37,6 @@ from .smooth import FrameSmoother
 from .solenoidal import without_divergence
 from .ultrasound.fields import fwhm_to_deviation
 
-# share of the forecast's error variance that an analysis leaves at least
-_LEAST_LEFT = 0.25
 # draws from the ensemble whose splines tell how large its spread is: each costs a thirtieth of an analysis
 _DRAWS = 3
 
@@ -62,16 +61,18 @@ class Cycle:
         self.generator = torch.Generator().manual_seed(seed)
         self.augmentation = Augmentation(tuple(one.parameter for one in options.estimated))
         self.gain = LearnedGain(len(options.increments), self.grid.dimension, memory=options.memory)
-        self.spread = SpreadMatch()
+        self.spread = SpreadMatch(averaged=options.memory)
         self.first_group = np.cumsum([0] + [source.groups for source in self.sources]).tolist()
         self.scale = ErrorScale(self.first_group[-1], memory=options.memory)
         self.record = FilterRecord(seed=seed)
         self.spline = InnovationSpline(splines, options.choose_every)
+        self.lagged = None if options.lag is None else LaggedAnalyses(options.lag)
         self.offered: Tensor | None = None  # (J, D, *shape) increments of the last analysis
         self.fields: list[Tensor] = []
         self.sigmas: list[Tensor] = []
         self.missing: list[int] = []
         self.events: list[dict[str, Any]] = []
+        self.shocks: list[float] = []
         self.ensemble: Ensemble | None = None
 
     @property
@@ -112,6 +113,7 @@ class Cycle:
         generator = self._forked()
         noise = self._perturbations(frame, 1.0, generator) if is_last() and self.options.model_error > 0 else None
         forecasts = self.forecaster.advance(self.ensemble, before, early, times, masks)
+        self.shocks.append(forecasts.shock)
         states = self._prepared(forecasts, from_last(noise), frame)
         look = self._look([(source, what, _nearest(times, time)) for source, what, time in seen], states, masks)
         missing = int((late & ~forecasts.covered).sum())
@@ -157,11 +159,15 @@ class Cycle:
         if int((~failed).sum()) < 2:  # too few to draw from: a new ensemble around the control
             fresh = self._perturbations(frame, self.usual)
             members = torch.stack([state.control + fresh for state in states], 1)
+            if self.lagged is not None:
+                self.lagged.clear()
             self.events.append({"time": time, "failed": torch.nonzero(failed).flatten().tolist(), "donor": "control"})
         else:
             repaired = replace_failed(members.flatten(1), failed, self.generator)
             members = repaired.ensemble.reshape(members.shape)
             self.events += [{"time": time, "failed": e.member, "donor": e.donor} for e in repaired.events]
+            for event in repaired.events if self.lagged is not None else ():
+                self.lagged.replaced(event.member, event.donor)
         return [replace(state, members=members[:, k]) for k, state in enumerate(states)]
 
     # --- observations ---------------------------------------------------------------------------------
@@ -211,19 +217,22 @@ class Cycle:
         drawn = self._drawn(look)
         tasks = [
             partial(self._splines, torch.cat([screened.innovation[None], drawn]), weight, look, frame),
-            partial(self._filtered, joint, look, positions, state.control, frame, self._forked()),
+            partial(self._filtered, joint, look, positions, state.control, frame, inside, self._forked()),
         ]
-        (found, choice), (analysis, regions) = shared(tasks)
+        (found, choice), (analysis, regions, earlier) = shared(tasks)
+        if self.lagged is not None:
+            self._take_earlier(earlier)
         self.spline.restore(choice)
         look = replace(look, regions=regions)
         self._record(analysis, look, forecast, inside, frame)
         self.offered = self._increments(analysis, found, inside, state.control, frame)
         change = torch.einsum("j,jd...->d...", self.gain.weight.to(torch.float32), self.offered)
-        self._match_spread(masks, look, weight, drawn, found)
+        self._match_spread(masks, look, weight > 0, drawn, found)
         self.scale.learn(analysis, look.observations, look.group)
         control = state.control + change
         anomalies, parameters = self._on_grid(analysis.ensemble[:, :size] - analysis.mean[:size], inside), {}
-        left = self._left(look, self._seen(anomalies, masks, look), self._seen(change[None], masks, look)[0], weight)
+        before, after = (float(part.double().var(0).sum()) for part in (forecast, analysis.ensemble[:, :size]))
+        left = self.spread.left(before, after, float(change[:, mask].double().square().sum()))
         anomalies = left * anomalies
         if state.parameters:
             _, parameters = self.augmentation.split(analysis.ensemble)
@@ -238,13 +247,16 @@ class Cycle:
         return self.spline.of(values, weight, look, frame), self.spline.state()
 
     def _filtered(
-        self, joint: Tensor, look: Look, positions: Tensor, control: Tensor, frame: int, generator: torch.Generator
-    ) -> tuple[Analysis, dict[str, Tensor]]:
-        """The filter's analysis, without its map of the members, which is large and has served; and the regions."""
+        self, joint: Tensor, look: Look, positions: Tensor, control: Tensor, frame: int, inside: Tensor,
+        generator: torch.Generator,
+    ) -> tuple[Analysis, dict[str, Tensor], list[Lagged]]:
+        """The filter's analysis, without its map of the members, which is large and has served; regions; the past."""
         analysis = self.filter.analyse(
             joint, look.members, look.observations, state_positions=positions, generator=generator
         )
-        return replace(analysis, transform=None), self._regions(look.parts, control, frame)
+        numbers = self.grid.dimension * len(inside)
+        earlier = [] if self.lagged is None else self.lagged.improved(analysis, inside, numbers)
+        return replace(analysis, transform=None), self._regions(look.parts, control, frame), earlier
 
     def _forked(self) -> torch.Generator:
         """A generator of its own for what one process alone may do."""
@@ -277,29 +289,22 @@ class Cycle:
             offered.append(torch.diag_embed(whole.movedim(0, -1)).movedim((-2, -1), (0, 1)))
         return torch.cat(offered)
 
-    def _left(self, look: Look, anomalies: Tensor, change: Tensor, weight: Tensor) -> float:
-        """Factor on the analysed anomalies, seen (N, m), that leaves them what the analysis left of the error.
-
-        With weights that make the innovations white the error's variance falls by the increment's own; the filter
-        believes that it did more, because it takes its own increment for the one that was followed.
-        """
-        before = float((weight * look.members.double().var(0)).nan_to_num().sum())
-        after = float((weight * anomalies.double().var(0)).sum())
-        taken = float((weight * change.double().square()).sum())
-        target = max(before - taken, _LEAST_LEFT * before)
-        return (target / after) ** 0.5 if after > 0 else 1.0
-
     def _match_spread(
-        self, masks: list[Tensor], look: Look, weight: Tensor, drawn: Tensor, found: Tensor
+        self, masks: list[Tensor], look: Look, used: Tensor, drawn: Tensor, found: Tensor
     ) -> None:
-        """Compare what splines (1 + k, D, *shape) find in the innovations and in draws from the ensemble (k, m)."""
+        """Compare what splines (1 + k, D, *shape) find in the innovations and in draws from the ensemble (k, m).
+
+        Every observation in use counts alike: the spread stands for the error of the whole state, most of which lies
+        where the observations are worst, in jets and shear.
+        """
         if not len(found):
             return
         parts, first = self.grid.dimension, self.options.increments.index("spline") * self.grid.dimension
         seen = self._seen(self.offered, masks, look)
         followed = self.gain.weight @ seen
-        shown = float((weight * seen[first : first + parts].sum(0) * followed).sum())
-        self.spread.learn(shown, float((weight * self._seen(found[1:], masks, look) * drawn).sum()) / len(drawn))
+        shown = float((seen[first : first + parts].sum(0) * followed)[used].sum())
+        own = float((self._seen(found[1:], masks, look) * drawn)[:, used].sum()) / len(drawn)
+        self.spread.learn(shown, own)
 
     def _coast(self, state: Ensemble, mask: Tensor, missing: int, time: float) -> None:
         """Nothing was measured: the forecast is the analysis."""
@@ -329,11 +334,25 @@ class Cycle:
         return full.reshape(len(values), self.grid.dimension, *self.grid.shape)
 
     def _keep(self, control: Tensor, sigma: Tensor, missing: int) -> None:
-        mask = np.array(self.measured.mask[len(self.fields)], bool)
-        clean = without_divergence(control.numpy(), mask, self.grid.spacing)
-        self.fields.append(torch.from_numpy(clean).to(torch.float32))
+        if self.lagged is not None:
+            self.lagged.add(self.done, control, self.ensemble.members - self.ensemble.control, sigma)
+        self.fields.append(self._clean(control, self.done))
         self.sigmas.append(sigma.to(torch.float32))
         self.missing.append(missing)
+
+    def _take_earlier(self, earlier: list[Lagged]) -> None:
+        self.lagged.take(earlier)
+        for one in earlier:
+            mask = self.mask(one.frame)
+            self.fields[one.frame] = self._clean(torch.where(mask, one.control, 0.0), one.frame)
+            self.sigmas[one.frame] = one.sigma
+
+    def _clean(self, control: Tensor, frame: int) -> Tensor:
+        mask = np.array(self.measured.mask[frame], bool)
+        found = without_divergence(control.numpy(), mask, self.grid.spacing)
+        if not found.converged:
+            self.events.append({"time": float(self.measured.time[frame]), "divergence_left": found.left})
+        return torch.from_numpy(found.velocity).to(torch.float32)
 
     def state(self) -> dict[str, Any]:
         """Everything that the next step depends on, as tensors and plain values."""
@@ -343,7 +362,8 @@ class Cycle:
             "generator": self.generator.get_state(), "gain": self.gain.state(), "spread": self.spread.state(),
             "scale": self.scale.state(), "record": self.record.state(), "spline": self.spline.state(),
             "offered": self.offered, "fields": list(self.fields), "sigmas": list(self.sigmas),
-            "missing": list(self.missing), "events": list(self.events),
+            "missing": list(self.missing), "events": list(self.events), "shocks": list(self.shocks),
+            "lagged": [] if self.lagged is None else self.lagged.state(),
         }  # fmt: skip
 
     def restore(self, state: dict[str, Any]) -> None:
@@ -353,7 +373,9 @@ class Cycle:
             getattr(self, name).restore(state[name])
         self.offered = state["offered"]
         self.fields, self.sigmas = list(state["fields"]), list(state["sigmas"])
-        self.missing, self.events = list(state["missing"]), list(state["events"])
+        self.missing, self.events, self.shocks = (list(state[name]) for name in ("missing", "events", "shocks"))
+        if self.lagged is not None:
+            self.lagged.restore(state["lagged"])
 
 
 def _nearest(times: list[float], time: float) -> int:

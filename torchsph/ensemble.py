@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -164,10 +166,29 @@ def _accounts(cycle: Cycle) -> dict[str, Any]:
         name: {"mean": float(row.mean()), "deviation": float(row.std())}
         for name, row in cycle.ensemble.parameters.items()
     }
+    divergent = [event["divergence_left"] for event in cycle.events if "divergence_left" in event]
+    if divergent:
+        warnings.warn(
+            f"removing the divergence did not converge in {len(divergent)} analyses (of the divergence up to "
+            f"{max(divergent):.2g} is left); 1 means that the field was left alone", RuntimeWarning, stacklevel=3,
+        )
     return {
-        "members": cycle.count, "replaced_members": replaced, "events": cycle.events,
+        "members": cycle.count, "replaced_members": replaced, "events": cycle.events, "shocks": _shocks(cycle),
+        "divergence_not_converged": len(divergent),
         "coasted_frames": sum(1 for event in cycle.events if "coasted" in event),
         "gain": dict(zip(cycle.options.increments, weights, strict=True)), "spread_factor": cycle.spread.factor,
         "observation_error_scale": cycle.scale.factor.tolist(), "kernel": [one.kernel for one in cycle.sources],
         "estimated": learned, "filter": cycle.record.summary(), "options": repr(cycle.options),
     }  # fmt: skip
+
+
+def _shocks(cycle: Cycle) -> list[dict[str, float | None]]:
+    """How abrupt each analysis was for the particles that took it up: the part of their velocities that they lost.
+
+    It is what was divergent, or went through a wall: RMS, relative to the flow's. None where a scheme does not project.
+    """
+    starts = cycle.measured.time[: len(cycle.shocks)].tolist()
+    return [
+        {"time": time, "shock": shock if math.isfinite(shock) else None}
+        for time, shock in zip(starts, cycle.shocks, strict=True)
+    ]

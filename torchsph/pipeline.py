@@ -12,6 +12,7 @@ import geometry
 import regularize
 
 from .ensemble import assimilate
+from .ensemble_options import EnsembleOptions
 from .forecast import ForecastSkill, skill
 from .free_run import run_freely
 from .observation_error import estimate_error
@@ -55,16 +56,16 @@ def make_smoother(preset: str) -> regularize.Smoother:
 def run_methods(
     measured: geometry.Recording, methods: Sequence[str], *, preset: str = "default", spacing: float | None = None,
     members: int | None = None, also: Sequence[geometry.Recording] = (), truth: geometry.Recording | None = None,
-    checkpoints: str | Path | None = None, resume: bool = False, seed: int = 0, device: str = "cpu",
-    progress: bool = False,
+    lag: int | None = None, checkpoints: str | Path | None = None, resume: bool = False, seed: int = 0,
+    device: str = "cpu", progress: bool = False,
 ) -> dict[str, MethodResult]:
     """Run methods by name on one measurement, in the order of ``METHODS``.
 
     "free", the run without data, comes along with every method that simulates. ``spacing`` (m) of the particles
     defaults to ``ANALYSIS_SPACING`` grid spacings, half of it in the ensemble's control run; ``members`` to
-    ``DEFAULT_MEMBERS``. ``also``, ``truth``, ``checkpoints`` and ``resume`` are the ensemble's (``assimilate``); the
-    other methods know one measurement. The seconds of a method include the spline that it starts from only where
-    "spline" itself was not asked for.
+    ``DEFAULT_MEMBERS``. ``also``, ``truth``, ``lag``, ``checkpoints`` and ``resume`` are the ensemble's
+    (``assimilate``, ``EnsembleOptions``); the other methods know one measurement. The seconds of a method include the
+    spline that it starts from only where "spline" itself was not asked for.
 
     Under torchrun all processes share the splines and the ensemble; the first one runs "sph" meanwhile and the last
     one "free". What the first one returns is complete.
@@ -97,8 +98,9 @@ def run_methods(
     if "ensemble" in methods:
         many = assimilate(
             measured, make_model(measured, preset=preset, spacing=CONTROL_SHARE * spacing, device=device),
-            coarse=model, members=DEFAULT_MEMBERS if members is None else members, also=also, splines=splines,
-            smoothed=smoothed, truth=truth, checkpoints=checkpoints, resume=resume, seed=seed, progress=progress,
+            coarse=model, members=DEFAULT_MEMBERS if members is None else members, options=EnsembleOptions(lag=lag),
+            also=also, splines=splines, smoothed=smoothed, truth=truth, checkpoints=checkpoints, resume=resume,
+            seed=seed, progress=progress,
         )
         results["ensemble"] = timer.result(many.recording, many.info)
     free = from_last(results.get("free"))

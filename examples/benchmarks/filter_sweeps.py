@@ -1,10 +1,12 @@
 """Ensemble against spline on measurements of a known flow, while one thing at a time is made harder or easier.
 
-    python examples/benchmarks/filter_sweeps.py TRUTH.h5 [--quick] [--only noise] [--json FILE] [--figure FILE]
+    python examples/benchmarks/filter_sweeps.py TRUTH.h5 [--quick] [--stretch 0.18 0.38] [--only noise]
+        [--json FILE] [--figure FILE] [--rows FILE]
 
 Frame rate (25 to 200 Hz), noise (half to double), members, a weight that says nothing, and one Doppler component
 alone. Measurements are made by ``torchsph.ultrasound.measure_noise``; all settings of both methods are automatic, the
-same in every case, and neither sees the truth. ``--quick`` takes 100 ms around the fastest flow and fewer cases.
+same in every case, and neither sees the truth. ``--stretch`` takes a part of the recording (s), ``--quick`` 100 ms
+around the fastest flow and fewer cases; ``--rows`` draws what an earlier run wrote.
 Errors are RMS error / RMS speed of the truth over the mask; "smoothed" is the spline averaged over time (Gaussian of
 10 ms), "free" the simulation without data.
 """
@@ -65,7 +67,7 @@ def cases(frame: float, quick: bool) -> Iterator[Case]:
     """All cases for a truth with a frame every ``frame`` s."""
     for rate in (50, 100) if quick else (25, 50, 100, 200):
         yield Case("frame rate, Hz", rate, replace(BASE, every=max(1, round(1 / rate / frame))))
-    for factor in (0.5, 2.0):
+    for factor in (0.5, 1.0, 2.0):
         yield Case("noise factor", factor, replace(BASE, lateral=factor * BASE.lateral, axial=factor * BASE.axial))
     for members in (8, 32) if quick else (8, 16, 32, 64):
         yield Case("members", members, members=members)
@@ -100,9 +102,10 @@ def run(case: Case, truth: geometry.Recording, seed: int) -> dict:
     }  # fmt: skip
     error = {name: evaluate(one, truth)["nrmse"].value for name, one in found.items()}
     return {
-        "sweep": case.sweep, "value": case.value, "members": case.members, "nrmse": error,
+        "members": case.members, "nrmse": error,
         "to_spline": error["ensemble"] / error["spline"], "to_smoothed": error["ensemble"] / error["smoothed"],
         "spread_over_skill": spread_over_skill(ensemble.recording, truth).value, "seconds": seconds,
+        "frames": measured.frames,
         "real_time_factor": seconds / float(np.ptp(measured.time)), "gain": ensemble.info["gain"],
     }  # fmt: skip
 
@@ -142,25 +145,36 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("truth", type=Path)
     parser.add_argument("--quick", action="store_true", help="a short stretch and fewer cases")
+    parser.add_argument("--stretch", type=float, nargs=2, metavar="S", help="part of the recording")
     parser.add_argument("--only", default="", help="part of a sweep's name")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--json", type=Path, help="also write the rows here")
     parser.add_argument("--figure", type=Path, help="also draw the sweeps here")
+    parser.add_argument("--rows", type=Path, help="draw what --json of an earlier run holds, and run nothing")
     options = parser.parse_args()
+    if options.rows:
+        draw(json.loads(options.rows.read_text())["rows"], options.figure)
+        return
     torch.set_num_threads(options.threads)
     truth = geometry.read_recording(options.truth)
     truth = around_the_fastest(truth) if options.quick else truth
-    rows = []
+    if options.stretch is not None:
+        first, last = options.stretch
+        truth = truth.select((truth.time > first - 1e-6) & (truth.time < last + 1e-6))
+    rows, done = [], {}
     for case in cases(float(np.median(np.diff(truth.time))), options.quick):
         if options.only not in case.sweep:
             continue
-        rows.append(run(case, truth, options.seed))
+        key = replace(case, sweep="", value="")  # the case that all sweeps have in common runs once
+        done[key] = done.get(key) or run(case, truth, options.seed)
+        rows.append({"sweep": case.sweep, "value": case.value, **done[key]})
         errors = "  ".join(f"{name} {value:.3f}" for name, value in rows[-1]["nrmse"].items())
         print(f"{case.sweep:15s} {case.value!s:22s} {errors}  ratio {rows[-1]['to_spline']:.3f} "
               f"spread/skill {rows[-1]['spread_over_skill']:.2f}  {rows[-1]['seconds']:.0f} s", flush=True)  # fmt: skip
         if options.json:  # after each case: a long sweep may be stopped
-            options.json.write_text(json.dumps(rows, indent=1))
+            about = {"seconds_of_flow": truth.time[[0, -1]].tolist(), "threads": options.threads, "seed": options.seed}
+            options.json.write_text(json.dumps(about | {"rows": rows}, indent=1) + "\n")
     if options.figure:
         draw(rows, options.figure)
 

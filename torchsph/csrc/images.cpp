@@ -5,8 +5,10 @@
 #endif
 
 #include <algorithm>
+#include <cmath>
 #include <cstdint>
 #include <cstring>
+#include <limits>
 #include <vector>
 
 #include "interface.h"
@@ -80,7 +82,10 @@ class Arranger {
     }
     for (int64_t i = 0; i < count; ++i) power[node + i] = square[i] / Real(a.images);
     if (turn)
-      for (int64_t i = 0; i < count; ++i) turn[2 * (node + i)] = real[i], turn[2 * (node + i) + 1] = imaginary[i];
+      for (int64_t i = 0; i < count; ++i) {
+        const Real root = std::sqrt(std::max(power[node + i], std::numeric_limits<Real>::min()));
+        turn[2 * (node + i)] = real[i] / root, turn[2 * (node + i) + 1] = imaginary[i] / root;
+      }
     if (!volume) return;
     for (int64_t i = 0; i < count; ++i) {
       Real* to = volume + 2 * a.images * (node + i);
@@ -106,20 +111,22 @@ void box_sums(const sph_boxes& a) {
   auto* out = static_cast<Real*>(a.out);
 #pragma omp parallel num_threads(a.threads)
   {
-    std::vector<Real> sum(2 * a.reach[2] + 1);
+    std::vector<Real> sum(a.parts * (2 * a.reach[2] + 1));
 #pragma omp for schedule(static)
     for (int64_t p = 0; p < a.points; ++p) {
       const Box box(a, a.middle + 3 * p);
-      const int64_t count = box.high[2] - box.low[2] + 1;
+      const int64_t count = a.parts * (box.high[2] - box.low[2] + 1);
       std::fill(sum.begin(), sum.end(), Real(0));
       for (int64_t z = box.low[0]; z <= box.high[0]; ++z)
         for (int64_t y = box.low[1]; y <= box.high[1]; ++y) {
-          const Real* row = field + (z * a.shape[1] + y) * a.shape[2] + box.low[2];
+          const Real* row = field + a.parts * ((z * a.shape[1] + y) * a.shape[2] + box.low[2]);
           for (int64_t i = 0; i < count; ++i) sum[i] += row[i];
         }
-      Real total = 0;
-      for (int64_t i = 0; i < count; ++i) total += sum[i];
-      out[p] = total;
+      for (int64_t part = 0; part < a.parts; ++part) {
+        Real total = 0;
+        for (int64_t i = part; i < count; i += a.parts) total += sum[i];
+        out[a.parts * p + part] = total;
+      }
     }
   }
 }

@@ -133,16 +133,17 @@ typedef struct { /* a packet's images put side by side at each node; see images.
   const void* samples;         /* (images, z, y, x) complex */
   void* volume;                /* (.., images) complex, or null; their rims are filled with 0 */
   void* power;                 /* (..) mean square */
-  void* turn;                  /* (..) complex sum of conj(sample) times that of the next image, or null */
+  void* turn;                  /* (..) complex sum of conj(sample) times that of the next image, over the
+                                  root of the power, or null */
 } sph_images;
 
-typedef struct { /* sums of a real field over boxes around points; see images.cpp */
+typedef struct { /* sums of a field over boxes around points; see images.cpp */
   int32_t threads;
-  int64_t points;
+  int64_t points, parts;      /* parts: 1 for a real field, 2 for a complex one */
   int64_t shape[3], reach[3]; /* along z, y, x: of the field, and of a box to either side, in nodes */
   const void* field;
   const int64_t* middle;      /* (points, 3) nodes */
-  void* out;                  /* (points,) */
+  void* out;                  /* (points,), of the field's type */
 } sph_boxes;
 
 typedef struct { /* points and a periodic lattice; see gridding.cpp */

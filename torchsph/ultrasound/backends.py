@@ -13,6 +13,8 @@ from .compiled import CompiledBackend
 from .correlation import KernelShape
 from .reference import ReferenceBackend
 
+NAMES = ("auto", "cpu", "reference")
+
 
 class Backend(Protocol):
     """Sums over images and over boxes of nodes; all per-axis numbers in array order z, y, x.
@@ -32,7 +34,7 @@ class Backend(Protocol):
         """Images (T, z, y, x) side by side at every node, (Z, Y, X, T) with a rim of ``margin`` zero nodes.
 
         Also (Z, Y, X): their mean power, and with ``turns`` their lag-one autocorrelation, the sum of each
-        sample's conjugate times the sample of the next image.
+        sample's conjugate times the sample of the next image, over the root of the power.
         """
         ...
 
@@ -58,8 +60,8 @@ def backend(name: str = "auto", device: torch.device | str = "cpu") -> Backend:
     Raises ValueError where the name is unknown, or "cpu" was asked for and cannot be used: nothing slower is
     taken silently in its place.
     """
-    if name not in ("auto", "cpu", "reference"):
-        raise ValueError(f"unknown tracking backend {name!r}; known: auto, cpu, reference")
+    if name not in NAMES:
+        raise ValueError(f"unknown tracking backend {name!r}; known: {', '.join(NAMES)}")
     if name == "reference":
         return ReferenceBackend()
     problem = None

@@ -43,7 +43,7 @@ class _Boxes(ctypes.Structure):
 
     _fields_ = [
         ("threads", _int),
-        ("points", _long),
+        *((name, _long) for name in ("points", "parts")),
         *((name, _Triple) for name in ("shape", "reach")),
         *((name, _pointer) for name in ("field", "middle", "out")),
     ]
@@ -95,13 +95,7 @@ class CompiledBackend:
         return _box_sums(field.contiguous(), _nodes(middle, field.shape, half), half)
 
     def sums_around(self, field: Tensor, half: tuple[int, int, int]) -> Callable[[Tensor], Tensor]:
-        parts = field.real.contiguous(), field.imag.contiguous()
-
-        def sums(middle: Tensor) -> Tensor:
-            nodes = _nodes(middle, field.shape)
-            return torch.complex(*(_box_sums(part, nodes, half) for part in parts))
-
-        return sums
+        return lambda middle: _box_sums(field, _nodes(middle, field.shape), half)
 
     def correlate(
         self, volume: Tensor, apart: int, corner: Tensor, offset: Tensor, shape: KernelShape,
@@ -126,8 +120,8 @@ def _box_sums(field: Tensor, nodes: Tensor, half: tuple[int, int, int]) -> Tenso
     """Sums (P,) over the parts inside the volume of the boxes around ``nodes`` (P, 3)."""
     sums = field.new_empty(len(nodes))
     _call(
-        "box_sums", field.dtype, points=len(nodes), shape=tuple(field.shape), reach=half, field=field, middle=nodes,
-        out=sums,
+        "box_sums", field.dtype.to_real(), points=len(nodes), parts=1 + field.is_complex(), shape=tuple(field.shape),
+        reach=half, field=field, middle=nodes, out=sums,
     )  # fmt: skip
     return sums
 

@@ -69,8 +69,9 @@ class Prepared:
 
         The turn is the phase of the lag-one autocorrelation (Kasai et al., IEEE Trans. Sonics Ultrason. 32,
         1985), averaged over twice the kernel: with few numbers taken from the data, little of the speckle's own
-        phase gets into them. Its change is that to half a kernel further on, either side; from node to node it
-        would be that of single speckles, whose nodes turn together whatever the shear.
+        phase gets into them. Nodes weigh by amplitude instead of power, so that neither the brightest speckle nor
+        what is left of a wall nearby speaks for all. Its change is that to half a kernel further on, either side;
+        from node to node it would be that of single speckles, whose nodes turn together whatever the shear.
         """
         if self.wide_turn is None:
             return None
@@ -166,8 +167,6 @@ def prepare(
     volume, after, turn = backend.arrange(solid(filtered), margin, turns=follow_shear)
     averages = [None, None]
     if turn is not None:
-        # by amplitude instead of power: neither the brightest speckle nor what is left of a wall speaks for all
-        turn = turn / after.clamp_min(torch.finfo(after.dtype).tiny).sqrt()
         averages = [backend.sums_around(turn, tuple(size * h for h in shape.half)) for size in (1, 2)]
     gain = 1.0 if clutter is None else clutter.noise_gain(len(packet.iq))
     return Prepared(

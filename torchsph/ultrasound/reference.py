@@ -28,9 +28,12 @@ class ReferenceBackend:
     ) -> tuple[Tensor, Tensor, Tensor | None]:
         volume = images.new_zeros((*(n + 2 * m for n, m in zip(images.shape[1:], margin, strict=True)), len(images)))
         volume[tuple(slice(m, m + n) for m, n in zip(margin, images.shape[1:], strict=True))] = images.movedim(0, -1)
-        turn = torch.linalg.vecdot(volume[..., :-1], volume[..., 1:]) if turns else None  # conjugates the first
-        edges = [side for m in reversed(margin) for side in (m, m)]
-        return volume, F.pad(self.mean_power(images), edges), turn
+        mean = F.pad(self.mean_power(images), [side for m in reversed(margin) for side in (m, m)])
+        turn = None
+        if turns:
+            turn = torch.linalg.vecdot(volume[..., :-1], volume[..., 1:])  # conjugates the first
+            turn = turn / mean.clamp_min(torch.finfo(mean.dtype).tiny).sqrt()
+        return volume, mean, turn
 
     def box_sums(self, field: Tensor, middle: Tensor, half: tuple[int, int, int]) -> Tensor:
         blocks = gather(field[..., None], middle - middle.new_tensor(half), tuple(2 * h + 1 for h in half))

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from .acquisition import Acquisition, Packet, decibel
-from .backends import backend
+from .backends import NAMES, backend
 from .clutter import ClutterFilter, FIRFilter
 from .correlation import KernelShape
 from .estimates import Estimates, Flag, bit
@@ -74,6 +74,8 @@ class SpeckleTracker:
                 raise ValueError(f"{name} must be positive and finite, got {getattr(self, name)!r}")
         if self.min_samples < 3 or self.tile < 1:
             raise ValueError("min_samples must be >= 3 and tile >= 1")
+        if self.backend not in NAMES:
+            raise ValueError(f"backend must be one of {', '.join(NAMES)}, got {self.backend!r}")
         if not self.lags or list(self.lags) != sorted(set(self.lags)) or self.lags[0] < 1:
             raise ValueError(f"lags must be increasing whole numbers >= 1, got {self.lags!r}")
         for name in ("min_correlation", "lone_correlation"):
