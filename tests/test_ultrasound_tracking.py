@@ -108,6 +108,37 @@ def test_shear_is_told_to_some_per_cent(gradient):
     assert float(found.shear.median()) == pytest.approx(math.hypot(*gradient), rel=0.15)
 
 
+class Parabola:
+    """Axial flow 0.1 + 6e4 x^2 in blood everywhere."""
+
+    def velocity(self, points, time):
+        axial = 0.1 + 6e4 * points[:, 0].square()
+        return torch.stack([0 * axial, 0 * axial, axial], 1)
+
+    def blood(self, points, time):
+        return torch.ones(len(points), dtype=torch.bool)
+
+
+def test_a_bend_of_the_axial_flow_is_told():
+    """Half a kernel off, a parabola c x^2 is off its tangent by c h^2, on either side: 2 c h^2 off a straight line."""
+    axis = torch.arange(-3, 4, dtype=torch.float64) * 1e-3
+    points = torch.cartesian_prod(torch.zeros(1, dtype=torch.float64), axis, axis) + torch.tensor([0.0, 0.0, 24e-3])
+    scene = simulate_packet(Parabola(), cube(24), EchoModel(), 0.0, torch.Generator().manual_seed(0))
+    assert float(PLAIN.track(scene, points).bend.median()) == pytest.approx(2 * 6e4 * 0.5e-3**2, rel=0.3)
+
+
+def test_what_shear_leaves_of_the_correlation_is_believed():
+    """150/s leaves exp(-(0.25 ms 150/s k s)^2 / 4) = 0.86, k the phase per metre and s = 0.51 mm: below either gate."""
+    gradient = ((0, 0, 0), (0, 0, 0), (150.0, 0, 0))
+    scene, points = packet((0.2, 0.1, 0.2), gradient=gradient), lattice()
+    found = PLAIN.track(scene, points)
+    true = torch.tensor([0.2, 0.1, 0.2]) + torch.outer(points[:, 0].float(), torch.tensor([0, 0, 150.0]))
+    error = found.velocity - true
+    assert float(found.correlation.median()) == pytest.approx(0.86 / 1.01, abs=0.02)
+    assert found.accepted.float().mean() > 0.9 and (found.lag == 1).float().mean() > 0.9
+    assert error[found.accepted][:, 2].std() < 0.012 and error[found.accepted][:, :2].std() < 0.15
+
+
 # hard cases
 
 

@@ -23,8 +23,9 @@ class Prepared:
     A plane has a z axis of one node. volume (Z, Y, X, T); raw_power, power (Z, Y, X): mean squares over the
     images before and after the filter; spoilt (Z, Y, X): 1 where an image is not finite, ``None`` = nowhere.
     margin: nodes of padding. spacing (3,): m, 1 along an axis that is not there. noise: power of the thermal
-    noise after the filter, if known. turn: of the echoes from image to image, complex, around nodes (P, 3) of the
-    padded volume, ``None`` = not asked for. active: the axes that are there. backend: who does the sums.
+    noise after the filter, if known. turn, wide_turn: of the echoes from image to image, complex, averaged over a
+    kernel and over twice a kernel around nodes (P, 3) of the padded volume, ``None`` = not asked for. active: the
+    axes that are there. backend: who does the sums.
     """
 
     packet: Packet
@@ -37,6 +38,7 @@ class Prepared:
     spacing: Tensor
     noise: float | None
     turn: Callable[[Tensor], Tensor] | None
+    wide_turn: Callable[[Tensor], Tensor] | None
     active: tuple[int, ...]
     backend: Backend
 
@@ -71,16 +73,22 @@ class Prepared:
         what is left of a wall nearby speaks for all. Its change is that to half a kernel further on, either side;
         from node to node it would be that of single speckles, whose nodes turn together whatever the shear.
         """
-        if self.turn is None:
+        if self.wide_turn is None:
             return None
-        middle, gradient = self.middle(nodes), self.power.new_zeros((len(nodes), 3))
-        here = self.turn(middle)
+        gradient = self.power.new_zeros((len(nodes), 3))
+        for axis, (before, after) in self._changes(self.wide_turn, nodes).items():
+            gradient[:, axis] = (before + after).angle() / self.shape.half[axis]
+        return gradient
+
+    def _changes(self, turn: Callable[[Tensor], Tensor], nodes: Tensor) -> dict[int, tuple[Tensor, Tensor]]:
+        """By axis, how ``turn`` changes from half a kernel before to ``nodes`` (P, 3), and from there on; complex."""
+        middle = self.middle(nodes)
+        here, changes = turn(middle), {}
         for axis in self.active:
             step = torch.zeros_like(middle)
             step[:, axis] = self.shape.half[axis]
-            change = self.turn(middle - step).conj() * here + here.conj() * self.turn(middle + step)
-            gradient[:, axis] = change.angle() / self.shape.half[axis]
-        return gradient
+            changes[axis] = turn(middle - step).conj() * here, here.conj() * turn(middle + step)
+        return changes
 
     def shear(self, ramp: Tensor | None, points: int) -> Tensor:
         """Size (points,), 1/s, of the gradient of the axial velocity; NaN where it was not asked for."""
@@ -88,6 +96,18 @@ class Prepared:
             return self.power.new_full((points,), math.nan)
         acquisition = self.packet.acquisition
         return (ramp / self.spacing).norm(dim=1) / (acquisition.phase_per_metre * acquisition.interval)
+
+    def bend(self, nodes: Tensor) -> Tensor:
+        """How far the axial velocity half a kernel further on, either side, is off a straight line, (P,), m/s.
+
+        All axes together, from the turn of single kernels; NaN where it was not asked for. A kernel's mean
+        is off its middle by as much, whatever the gradient.
+        """
+        if self.turn is None:
+            return self.power.new_full((len(nodes),), math.nan)
+        parts = [(before.conj() * after).angle() for before, after in self._changes(self.turn, nodes).values()]
+        acquisition = self.packet.acquisition
+        return torch.stack(parts).norm(dim=0) / (acquisition.phase_per_metre * acquisition.interval)
 
     def holds(self, nodes: Tensor) -> Tensor:
         """Whether kernels around ``nodes`` (P, 3), and one node beyond, lie inside the image: (P,) bool."""
@@ -145,11 +165,13 @@ def prepare(
             f"lag of {least_images - 1}; use a longer packet or a shorter filter"
         )
     volume, after, turn = backend.arrange(solid(filtered), margin, turns=follow_shear)
+    averages = [None, None]
+    if turn is not None:
+        averages = [backend.sums_around(turn, tuple(size * h for h in shape.half)) for size in (1, 2)]
     gain = 1.0 if clutter is None else clutter.noise_gain(len(packet.iq))
     return Prepared(
         packet, shape, volume, after if clutter is None else padded(before), after, spoilt, margin,
         torch.tensor([1.0] * len(lead) + spacing, dtype=after.dtype, device=after.device),
         None if packet.noise is None else packet.noise * gain,
-        None if turn is None else backend.sums_around(turn, tuple(2 * h for h in shape.half)),
-        tuple(range(len(lead), 3)), backend,
+        *averages, tuple(range(len(lead), 3)), backend,
     )  # fmt: skip

@@ -45,8 +45,9 @@ class SpeckleTracker:
     min_blood: least share of the unfiltered power that passes the filter, dB, or ``None``.
     min_response: least response of the clutter filter at the estimate's own Doppler frequency, dB, or ``None``.
     min_correlation: least correlation; lone_correlation: the same where no longer lag confirms the first,
-        whose axial phase may then be a whole turn off. Both are of the echoes without their noise: where that
-        is known, echoes that make up a share s of the power need s times as much, but at least 0.5.
+        whose axial phase may then be a whole turn off. Both are of what noise and shear leave: echoes that make
+        up a share s of the power need s times as much, and so do those of which shear (where it is followed)
+        leaves a share s of the correlation; but at least 0.5.
     tile: points worked on at a time, which bounds memory.
     backend: who does the sums: "cpu", compiled code, "reference", torch on any device, or "auto".
     """
@@ -111,10 +112,12 @@ def _track_tile(images: Prepared, nodes: Tensor, beam: Tensor, options: SpeckleT
     packet, interval = images.packet, images.packet.acquisition.interval
     kept = torch.nonzero(flags == 0)[:, 0]
     ramp = images.ramp(nodes)
-    motion = _follow(images, nodes[kept], beam[kept], None if ramp is None else ramp[kept], options)
+    within = None if ramp is None else ramp[kept]
+    motion = _follow(images, nodes[kept], beam[kept], within, options)
     velocity = motion.shift[:, axes] / interval
     response = _response((motion.shift * beam[kept]).sum(1), packet.acquisition, options.clutter)
-    flags[kept] = _doubts(velocity, motion, snr[kept], response, options)
+    coherent = _echo_share(snr[kept]) * (1 if within is None else _sheared(motion, within / images.spacing))
+    flags[kept] = _doubts(velocity, motion, coherent, response, options)
 
     def spread(values: Tensor, otherwise: float) -> Tensor:
         return values.new_full((len(nodes), *values.shape[1:]), otherwise).index_copy(0, kept, values)
@@ -125,7 +128,7 @@ def _track_tile(images: Prepared, nodes: Tensor, beam: Tensor, options: SpeckleT
         # of what was not correlated nothing is known but that it is within the range
         variance=spread(motion.variance[:, axes] / interval**2, options.search**2),
         power=share, snr=snr, response=spread(response, 0.0), shear=images.shear(ramp, len(nodes)),
-        lag=spread(motion.lag, options.lags[0]), flags=flags,
+        bend=images.bend(nodes), lag=spread(motion.lag, options.lags[0]), flags=flags,
     )  # fmt: skip
 
 
@@ -158,10 +161,27 @@ def _response(axial: Tensor, acquisition: Acquisition, clutter: ClutterFilter | 
     return decibel(torch.from_numpy(clutter.response(frequency)).clamp_min(1e-12)).to(axial)
 
 
+def _echo_share(snr: Tensor) -> Tensor:
+    """Share (P,) of the power that is not noise, from power over noise, dB; 1 where that is unknown."""
+    return torch.nan_to_num(1 - 10 ** (-snr / 10), nan=1.0)
+
+
+def _sheared(motion: Motion, gradient: Tensor) -> Tensor:
+    """Correlation (P,) that the true lag has left where echoes turn by ``gradient`` (P, 3), rad/m per image.
+
+    Turning a kernel's samples back does nothing about the scatterers within one sample: a Gaussian point spread
+    of amplitude deviation s keeps exp(-g^2 s^2 / 4) of its correlation (the transform of its intensity at g,
+    between two images), and the curvature of the correlation's peak is 1 / (2 s^2).
+    """
+    turned = gradient * motion.lag[:, None]
+    exponent = torch.where(motion.curvature > 0, turned.square() / (8 * motion.curvature.clamp_min(1e-12)), 0)
+    return torch.exp(-exponent.sum(1))
+
+
 def _doubts(
-    velocity: Tensor, motion: Motion, snr: Tensor, response: Tensor, options: SpeckleTracker
+    velocity: Tensor, motion: Motion, coherent: Tensor, response: Tensor, options: SpeckleTracker
 ) -> Tensor:
-    """Flags (P,) of correlated points; velocity (P, D) m/s, power over noise (P,) and response (P,), dB."""
+    """Flags (P,) of correlated points; velocity (P, D) m/s, correlation to be expected (P,), response (P,), dB."""
     flags = bit(~motion.sound, Flag.FLAT)
     # a fit that overshoots by 2 % of the range is still the range's own edge
     flags |= bit((velocity.abs() > options.search * 1.02).any(1) & motion.sound, Flag.EDGE)
@@ -172,6 +192,5 @@ def _doubts(
     least = torch.where(
         alone, max(options.lone_correlation, options.min_correlation), options.min_correlation
     )
-    echoes = torch.nan_to_num(1 - 10 ** (-snr / 10), nan=1.0)  # share of the power that is not noise
     floor = min(LEAST_CORRELATION, options.min_correlation)
-    return flags | bit(motion.correlation < (least * echoes).clamp_min(floor), Flag.DECORRELATED)
+    return flags | bit(motion.correlation < (least * coherent).clamp_min(floor), Flag.DECORRELATED)
