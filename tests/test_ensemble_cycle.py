@@ -11,7 +11,7 @@ import torch.multiprocessing as multiprocessing
 import geometry
 import torchsph
 from regularize import Smoother
-from torchsph import EnsembleOptions, Estimated, Simulator, assimilate, estimate_error, preset
+from torchsph import EnsembleOptions, Estimated, Simulator, assimilate, cycle, estimate_error, preset
 from torchsph.assimilation import Parameter
 from torchsph.cycle import Cycle
 from torchsph.data import sample_measurement, sample_truth
@@ -19,6 +19,7 @@ from torchsph.members import Ensemble, Forecaster
 from torchsph.observing import Source
 from torchsph.scene import Scene
 from torchsph.smooth import FrameSmoother, smooth_frames
+from torchsph.solenoidal import Cleaned
 
 FRAMES = slice(10, 14)
 WIDE = 3.5e-3  # m, particles so coarse that a cycle takes a fraction of a second
@@ -210,6 +211,16 @@ def test_members_that_fail_are_replaced_and_the_events_recorded(given, monkeypat
     events = [event["failed"] for event in run.info["events"]]
     assert events == [0, [0, 1, 2], "control", 2]
     assert run.info["replaced_members"] == 4
+
+
+def test_an_analysis_whose_divergence_stays_is_counted_and_warned_of(given, monkeypatch):
+    def failing(velocity, mask, spacing):
+        return Cleaned(velocity, 1.0, False)
+
+    monkeypatch.setattr("torchsph.cycle.without_divergence", failing)
+    with pytest.warns(RuntimeWarning, match="divergence did not converge in 4 analyses"):
+        run = given.run(members=2)
+    assert run.info["divergence_not_converged"] == 4
 
 
 def test_a_failing_control_is_the_members_mean(given):

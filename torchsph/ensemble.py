@@ -169,22 +169,27 @@ def _accounts(cycle: Cycle) -> dict[str, Any]:
         name: {"mean": float(row.mean()), "deviation": float(row.std())}
         for name, row in cycle.ensemble.parameters.items()
     }
-    divergent = [event["divergence_left"] for event in cycle.events if "divergence_left" in event]
-    if divergent:
-        warnings.warn(
-            f"removing the divergence did not converge in {len(divergent)} analyses (of the divergence up to "
-            f"{max(divergent):.2g} is left); 1 means that the field was left alone", RuntimeWarning, stacklevel=3,
-        )
     kept = cycle.record.summary()
     kept["warnings"] = kept["warnings"] + _noisier(cycle)
     return {
         "members": cycle.count, "replaced_members": replaced, "events": cycle.events, "shocks": _shocks(cycle),
-        "divergence_not_converged": len(divergent),
+        "divergence_not_converged": _divergent(cycle),
         "coasted_frames": sum(1 for event in cycle.events if "coasted" in event),
         "gain": dict(zip(cycle.options.increments, weights, strict=True)), "spread_factor": cycle.spread.factor,
         "observation_error_scale": cycle.scale.factor.tolist(), "kernel": [one.kernel for one in cycle.sources],
         "estimated": learned, "filter": kept, "options": repr(cycle.options),
     }  # fmt: skip
+
+
+def _divergent(cycle: Cycle) -> int:
+    """The number of analyses whose divergence was not removed as asked for; warns of them."""
+    left = [event["divergence_left"] for event in cycle.events if "divergence_left" in event]
+    if left:
+        warnings.warn(
+            f"removing the divergence did not converge in {len(left)} analyses (of the divergence up to "
+            f"{max(left):.2g} is left); 1 means that the field was left alone", RuntimeWarning, stacklevel=4,
+        )  # fmt: skip
+    return len(left)
 
 
 def _noisier(cycle: Cycle) -> list[str]:
