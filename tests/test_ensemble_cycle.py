@@ -11,7 +11,7 @@ import torch.multiprocessing as multiprocessing
 import geometry
 import torchsph
 from regularize import Smoother
-from torchsph import EnsembleOptions, Estimated, Simulator, assimilate, cycle, estimate_error, preset
+from torchsph import EnsembleOptions, Estimated, Simulator, assimilate, estimate_error, preset
 from torchsph.assimilation import Parameter
 from torchsph.cycle import Cycle
 from torchsph.data import sample_measurement, sample_truth
