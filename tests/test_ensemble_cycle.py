@@ -16,6 +16,7 @@ from torchsph.assimilation import Parameter
 from torchsph.cycle import Cycle
 from torchsph.data import sample_measurement, sample_truth
 from torchsph.members import Ensemble, Forecaster
+from torchsph.observing import Source
 from torchsph.scene import Scene
 from torchsph.smooth import FrameSmoother, smooth_frames
 
@@ -164,6 +165,32 @@ def test_frames_without_data_are_forecast(given, frames):
     assert nrmse(run.recording) < 1.0
 
 
+@pytest.mark.slow  # a quarter of a minute
+def test_ten_frames_without_data_are_forecast_and_their_uncertainty_grows():
+    every = geometry.read_recording(sample_measurement()).select(slice(2, 15))
+    measured = silenced(every, list(range(1, 11)))
+    splines = FrameSmoother(measured, Smoother())
+    smoothed = smooth_frames(splines)
+    run = assimilate(measured, made_model(measured), members=2, splines=splines, smoothed=smoothed, seed=1)
+    assert run.info["coasted_frames"] == 10
+    assert any("no observation was used in this cycle" in words and "10 of 12" in words
+               for words in run.info["filter"]["warnings"])  # fmt: skip
+    sigma = [float(np.square(run.recording.sigma[f]).mean()) ** 0.5 for f in range(measured.frames)]
+    assert sigma[10] > 1.2 * sigma[1]
+    # blind through the opening of the valve, it finds back in two analyses: measured .74 before and .45 after
+    assert nrmse(run.recording.select([12])) < 0.7 * nrmse(run.recording.select([10]))
+
+
+def test_an_ensemble_without_spread_still_follows_the_measurement_and_says_so(given, plain, monkeypatch):
+    first = Cycle._first
+    none = torch.zeros(2, 1, 1, 1, 1)
+    monkeypatch.setattr(Cycle, "_first", lambda self, generator: (first(self, generator)[0], none))
+    run = given.run(members=2, options=EnsembleOptions(model_error=0.0))
+    assert np.isfinite(run.recording.velocity).all() and not run.recording.sigma.any()
+    assert any("collapsed" in words for words in run.info["filter"]["warnings"])
+    assert nrmse(run.recording) < 1.1 * nrmse(plain.recording)
+
+
 def test_members_that_fail_are_replaced_and_the_events_recorded(given, monkeypatch):
     """A member is lost in each cycle, once all of them and once the control."""
     advance, cycles = Forecaster.advance, iter(range(10))
@@ -264,15 +291,28 @@ def test_an_estimated_parameter_stays_in_its_bounds_and_moves(given):
         Estimated(Parameter("viscosity"), 1.0, 0.0)
 
 
-@pytest.mark.slow
-def test_observations_noisier_than_said_are_noticed(given):
+@pytest.mark.parametrize("fine", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_observations_noisier_than_said_are_noticed(given, fine):
+    """The file claims a tenth of the errors, or less; with a forecast of some worth the claim costs nothing."""
     told = replace(given.measured, sigma=np.full_like(given.measured.velocity, 0.004))
     splines = FrameSmoother(told, Smoother())
-    fine = made_model(told, FINE)
-    run = assimilate(told, fine, coarse=given.model, members=3, splines=splines, smoothed=given.smoothed, seed=1)
+    model = made_model(told, FINE) if fine else given.model
+    run = assimilate(told, model, coarse=given.model, members=3, splines=splines, smoothed=given.smoothed, seed=1)
     assert min(run.info["observation_error_scale"]) > 4.0
-    assert any("overconfident" in words for words in run.info["filter"]["warnings"])
-    assert nrmse(run.recording) < 1.1 * nrmse(given.smoothed)
+    words = run.info["filter"]["warnings"]
+    assert any("overconfident" in each for each in words)
+    assert sum("times as noisy" in each for each in words) == 3
+    if fine:
+        assert nrmse(run.recording) < 1.1 * nrmse(given.smoothed)
+
+
+def test_an_observation_that_claims_to_be_exact_is_refused_by_name(given):
+    sigma = np.full_like(given.measured.velocity, 0.05)
+    sigma[1] = 0.0
+    told = replace(given.measured, sigma=sigma)
+    source = Source(told, estimate_error(told, given.splines, given.smoothed), told.grid)
+    with pytest.raises(ValueError, match="zero or negative, which makes the gain singular"):
+        source.see(1)
 
 
 @pytest.mark.slow

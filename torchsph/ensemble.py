@@ -25,6 +25,9 @@ from .observing import Source
 from .simulator import Simulator
 from .smooth import FrameSmoother, smooth_frames
 
+# a deviation of the observation errors this many times the stated one is worth a warning
+_NOISY = 2.0
+
 
 @dataclass(frozen=True)
 class EnsembleRun:
@@ -172,14 +175,31 @@ def _accounts(cycle: Cycle) -> dict[str, Any]:
             f"removing the divergence did not converge in {len(divergent)} analyses (of the divergence up to "
             f"{max(divergent):.2g} is left); 1 means that the field was left alone", RuntimeWarning, stacklevel=3,
         )
+    kept = cycle.record.summary()
+    kept["warnings"] = kept["warnings"] + _noisier(cycle)
     return {
         "members": cycle.count, "replaced_members": replaced, "events": cycle.events, "shocks": _shocks(cycle),
         "divergence_not_converged": len(divergent),
         "coasted_frames": sum(1 for event in cycle.events if "coasted" in event),
         "gain": dict(zip(cycle.options.increments, weights, strict=True)), "spread_factor": cycle.spread.factor,
         "observation_error_scale": cycle.scale.factor.tolist(), "kernel": [one.kernel for one in cycle.sources],
-        "estimated": learned, "filter": cycle.record.summary(), "options": repr(cycle.options),
+        "estimated": learned, "filter": kept, "options": repr(cycle.options),
     }  # fmt: skip
+
+
+def _noisier(cycle: Cycle) -> list[str]:
+    """In words, which components of which measurements are far noisier than their error models say."""
+    words = []
+    for number, (source, first) in enumerate(zip(cycle.sources, cycle.first_group, strict=False)):
+        name = "the measurement" if number == 0 else f"further measurement {number}"
+        for part in range(source.groups):
+            times = float(cycle.scale.factor[first + part]) ** 0.5
+            what = "" if source.groups == 1 else f" in {'xyz'[part]}"
+            if times > _NOISY:
+                words.append(
+                    f"{name} is {times:.2g} times as noisy{what} as its errors say; it was trusted that much less"
+                )
+    return words
 
 
 def _shocks(cycle: Cycle) -> list[dict[str, float | None]]:
