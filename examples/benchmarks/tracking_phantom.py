@@ -126,7 +126,7 @@ def main() -> None:
         measured = measure_speckle(true, options, arguments.seed, progress=True)
         if arguments.measured:
             geometry.write_recording(arguments.measured, measured)
-    results = {"description": measured.description, "frames": len(frames), "calibration": calibration(measured, true)}
+    results = {"description": measured.description, "frames": frames, "calibration": calibration(measured, true)}
     print(f"measured in {time.perf_counter() - began:.0f} s", json.dumps(results, indent=1), flush=True)
     if arguments.out:
         arguments.out.mkdir(parents=True, exist_ok=True)
