@@ -75,7 +75,7 @@ def draw(path: Path, true: geometry.Recording, measured: geometry.Recording, qua
             ("error", shown, shown.velocity - true.velocity))  # fmt: skip
     columns = min(COLUMNS, len(measured.time))
     lines = -(-len(measured.time) // columns)
-    figure, axes = plt.subplots(3 * lines, columns, figsize=(1.6 * columns + 1, 7.2 * lines), squeeze=False)
+    figure, axes = plt.subplots(3 * lines, columns, figsize=(1.45 * columns + 1, 6.6 * lines), squeeze=False)
     top = float(np.percentile(np.linalg.norm(true.velocity, axis=1)[true.mask], 99.7))
     for axis in axes.flat:
         axis.set_axis_off()
@@ -93,8 +93,9 @@ def draw(path: Path, true: geometry.Recording, measured: geometry.Recording, qua
                 axis.plot(*(1e3 * segment.T), "k", lw=0.8)
             axis.set_aspect("equal")
             axis.set_title(f"{name}, {1e3 * moment:.0f} ms", fontsize=7)
-    figure.colorbar(image, ax=axes, label="speed (m/s)", shrink=0.4)
-    figure.savefig(path, dpi=72, bbox_inches="tight")
+    figure.subplots_adjust(wspace=0.02, hspace=0.1)
+    figure.colorbar(image, ax=axes, label="speed (m/s)", shrink=0.4, pad=0.01)
+    figure.savefig(path, dpi=85, bbox_inches="tight")
     plt.close(figure)
 
 
@@ -125,7 +126,7 @@ def main() -> None:
         measured = measure_speckle(true, options, arguments.seed, progress=True)
         if arguments.measured:
             geometry.write_recording(arguments.measured, measured)
-    results = {"description": measured.description, "frames": len(frames), "calibration": calibration(measured, true)}
+    results = {"description": measured.description, "frames": frames, "calibration": calibration(measured, true)}
     print(f"measured in {time.perf_counter() - began:.0f} s", json.dumps(results, indent=1), flush=True)
     if arguments.out:
         arguments.out.mkdir(parents=True, exist_ok=True)

@@ -24,7 +24,7 @@ class SpeckleOptions(ScannerOptions):
 
     kernel: float = 1e-3
     search: float = 1.0
-    training: int = 24
+    training: int = 48
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -89,7 +89,7 @@ class TrainingPlan:
     tissue_speed: deviation of each component of the tissue's velocity, m/s.
     """
 
-    simulations: int = 24
+    simulations: int = 48
     half: float = 4e-3
     margin: float = 1.5e-3
     step: float = 1e-3
