@@ -23,11 +23,12 @@ class Lagged:
 
 
 class LaggedAnalyses:
-    """The last ``lag`` analyses, improved by each later one (Evensen & van Leeuwen 2000; Cohn et al. 1994).
+    """The last ``lag`` analyses, moved by each later one (Evensen & van Leeuwen 2000; Cohn et al. 1994).
 
     The filter's transform of the members is a linear map, and the same map improves the states that those members came
     from: no backward pass, no model. What it moves the mean by is added to the estimate, what it takes from the
-    anomalies' deviation is taken from the claim.
+    anomalies' deviation is taken from the claim. It is as good as the sampled correlation between members and their
+    past; ``EnsembleOptions.lag`` says what that is worth.
     """
 
     def __init__(self, lag: int) -> None:
