@@ -221,10 +221,13 @@ class Smoother:
         *,
         divergence_points: torch.Tensor | None = None,
         box: tuple[Sequence[float], Sequence[float]] | None = None,
+        choice: Choice | None = None,
+        judged: int | None = None,
     ) -> list[SplineField]:
         """Fit B sets of samples velocities (B, n, D) at the same points and weights with one factorisation.
 
-        For ensemble members and frames of a fixed grid. Automatic choice is made once, from their mean.
+        For ensemble members and frames of a fixed grid. Automatic choice is made once, from their mean, or from the
+        set number ``judged``: the same linear estimate is then made of the others. ``choice`` as in :meth:`fit`.
         """
         velocities = torch.as_tensor(velocities)
         if velocities.ndim != 3 or len(velocities) == 0:
@@ -232,8 +235,11 @@ class Smoother:
         weight = torch.ones(velocities.shape[1]) if weight is None else torch.as_tensor(weight)
         where = (divergence_points, box, self.power)
         every = [FitData.checked(points, v, weight, wall, *where) for v in velocities]
-        problem = self._problem(replace(every[0], velocity=torch.stack([d.velocity for d in every]).mean(0)))
-        return problem.solve_all([data.velocity for data in every], self.tolerance, self.strict)
+        data = every[judged or 0]
+        if judged is None:
+            data = replace(data, velocity=torch.stack([d.velocity for d in every]).mean(0))
+        problem = self._problem(data) if choice is None else self._following(data, choice)
+        return problem.solve_all([one.velocity for one in every], self.tolerance, self.strict)
 
     def _problem(self, data: FitData) -> Problem:
         knots = knots_for(data, self)

@@ -16,8 +16,10 @@ from torchsph.assimilation import Parameter
 from torchsph.cycle import Cycle
 from torchsph.data import sample_measurement, sample_truth
 from torchsph.members import Ensemble, Forecaster
+from torchsph.observing import Source
 from torchsph.scene import Scene
 from torchsph.smooth import FrameSmoother, smooth_frames
+from torchsph.solenoidal import Cleaned
 
 FRAMES = slice(10, 14)
 WIDE = 3.5e-3  # m, particles so coarse that a cycle takes a fraction of a second
@@ -69,6 +71,7 @@ def assert_same(one, other):
     np.testing.assert_array_equal(one.recording.velocity, other.recording.velocity)
     np.testing.assert_array_equal(one.recording.sigma, other.recording.sigma)
     assert one.info["filter"] == other.info["filter"]
+    assert one.info["shocks"] == other.info["shocks"]
 
 
 class Stopped(RuntimeError):
@@ -90,7 +93,34 @@ def test_a_restart_in_the_middle_changes_no_bit(given, plain, tmp_path, monkeypa
     with pytest.raises(ValueError, match="belongs to a run with other"):
         given.run(checkpoints=path, resume=True, seed=2)
     assert_same(given.run(checkpoints=path, resume=True), plain)
+    assert [shock["time"] for shock in plain.info["shocks"]] == given.measured.time[:-1].tolist()
+    assert all(0 < shock["shock"] < 0.3 for shock in plain.info["shocks"])
     assert [file.name for file in tmp_path.iterdir()] == ["checkpoint.pt"]
+
+
+def test_later_frames_improve_earlier_analyses_alone(given, plain, tmp_path, monkeypatch):
+    """The last analysis and all forecasts stay; earlier ones come nearer to the next data; a restart changes no bit."""
+    options = EnsembleOptions(batch=2, lag=2)
+    late = given.run(options=options)
+    np.testing.assert_array_equal(late.recording.velocity[-1], plain.recording.velocity[-1])
+    assert late.info["filter"] == plain.info["filter"]
+    inside = np.asarray(given.measured.mask, bool)[:-1]
+    moved, sure, known = (np.moveaxis(part[:-1], 1, -1)[inside] for part in (
+        late.recording.velocity - plain.recording.velocity, late.recording.sigma, plain.recording.sigma
+    ))  # fmt: skip
+    assert 0 < np.square(moved).mean() < np.square(known).mean()
+    assert np.square(sure).mean() < np.square(known).mean()
+
+    def stopping(self, frame, step=Cycle.step):
+        if frame == 2:
+            raise Stopped
+        step(self, frame)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Cycle, "step", stopping)
+        with pytest.raises(Stopped):
+            given.run(options=options, checkpoints=tmp_path / "late.pt")
+    assert_same(given.run(options=options, checkpoints=tmp_path / "late.pt", resume=True), late)
 
 
 def take_part(rank: int, processes: int, folder: str) -> None:
@@ -136,6 +166,32 @@ def test_frames_without_data_are_forecast(given, frames):
     assert nrmse(run.recording) < 1.0
 
 
+@pytest.mark.slow  # a quarter of a minute
+def test_ten_frames_without_data_are_forecast_and_their_uncertainty_grows():
+    every = geometry.read_recording(sample_measurement()).select(slice(2, 15))
+    measured = silenced(every, list(range(1, 11)))
+    splines = FrameSmoother(measured, Smoother())
+    smoothed = smooth_frames(splines)
+    run = assimilate(measured, made_model(measured), members=2, splines=splines, smoothed=smoothed, seed=1)
+    assert run.info["coasted_frames"] == 10
+    assert any("no observation was used in this cycle" in words and "10 of 12" in words
+               for words in run.info["filter"]["warnings"])  # fmt: skip
+    sigma = [float(np.square(run.recording.sigma[f]).mean()) ** 0.5 for f in range(measured.frames)]
+    assert sigma[10] > 1.2 * sigma[1]
+    # blind through the opening of the valve, it finds back in two analyses: measured .74 before and .45 after
+    assert nrmse(run.recording.select([12])) < 0.7 * nrmse(run.recording.select([10]))
+
+
+def test_an_ensemble_without_spread_still_follows_the_measurement_and_says_so(given, plain, monkeypatch):
+    first = Cycle._first
+    none = torch.zeros(2, 1, 1, 1, 1)
+    monkeypatch.setattr(Cycle, "_first", lambda self, generator: (first(self, generator)[0], none))
+    run = given.run(members=2, options=EnsembleOptions(model_error=0.0))
+    assert np.isfinite(run.recording.velocity).all() and not run.recording.sigma.any()
+    assert any("collapsed" in words for words in run.info["filter"]["warnings"])
+    assert nrmse(run.recording) < 1.1 * nrmse(plain.recording)
+
+
 def test_members_that_fail_are_replaced_and_the_events_recorded(given, monkeypatch):
     """A member is lost in each cycle, once all of them and once the control."""
     advance, cycles = Forecaster.advance, iter(range(10))
@@ -155,6 +211,16 @@ def test_members_that_fail_are_replaced_and_the_events_recorded(given, monkeypat
     events = [event["failed"] for event in run.info["events"]]
     assert events == [0, [0, 1, 2], "control", 2]
     assert run.info["replaced_members"] == 4
+
+
+def test_an_analysis_whose_divergence_stays_is_counted_and_warned_of(given, monkeypatch):
+    def failing(velocity, mask, spacing):
+        return Cleaned(velocity, 1.0, False)
+
+    monkeypatch.setattr("torchsph.cycle.without_divergence", failing)
+    with pytest.warns(RuntimeWarning, match="divergence did not converge in 4 analyses"):
+        run = given.run(members=2)
+    assert run.info["divergence_not_converged"] == 4
 
 
 def test_a_failing_control_is_the_members_mean(given):
@@ -236,15 +302,28 @@ def test_an_estimated_parameter_stays_in_its_bounds_and_moves(given):
         Estimated(Parameter("viscosity"), 1.0, 0.0)
 
 
-@pytest.mark.slow
-def test_observations_noisier_than_said_are_noticed(given):
+@pytest.mark.parametrize("fine", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_observations_noisier_than_said_are_noticed(given, fine):
+    """The file claims a tenth of the errors, or less; with a forecast of some worth the claim costs nothing."""
     told = replace(given.measured, sigma=np.full_like(given.measured.velocity, 0.004))
     splines = FrameSmoother(told, Smoother())
-    fine = made_model(told, FINE)
-    run = assimilate(told, fine, coarse=given.model, members=3, splines=splines, smoothed=given.smoothed, seed=1)
+    model = made_model(told, FINE) if fine else given.model
+    run = assimilate(told, model, coarse=given.model, members=3, splines=splines, smoothed=given.smoothed, seed=1)
     assert min(run.info["observation_error_scale"]) > 4.0
-    assert any("overconfident" in words for words in run.info["filter"]["warnings"])
-    assert nrmse(run.recording) < 1.1 * nrmse(given.smoothed)
+    words = run.info["filter"]["warnings"]
+    assert any("overconfident" in each for each in words)
+    assert sum("times as noisy" in each for each in words) == 3
+    if fine:
+        assert nrmse(run.recording) < 1.1 * nrmse(given.smoothed)
+
+
+def test_an_observation_that_claims_to_be_exact_is_refused_by_name(given):
+    sigma = np.full_like(given.measured.velocity, 0.05)
+    sigma[1] = 0.0
+    told = replace(given.measured, sigma=sigma)
+    source = Source(told, estimate_error(told, given.splines, given.smoothed), told.grid)
+    with pytest.raises(ValueError, match="zero or negative, which makes the gain singular"):
+        source.see(1)
 
 
 @pytest.mark.slow

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from scipy.signal import firwin, freqz
+from scipy.signal import convolve, firwin, freqz
 
 from torchsph.ultrasound.clutter import FIRFilter, PolynomialFilter, SVDFilter
 
@@ -34,6 +34,14 @@ def test_fir_response_is_that_of_its_coefficients_and_of_tones():
         power = filtering.apply(tone(frequency)).abs().square()
         np.testing.assert_allclose(power.numpy(), filtering.response(np.array([frequency]))[0], rtol=1e-9)
     assert filtering.response(np.array([0.5]))[0] == pytest.approx(1)
+
+
+@pytest.mark.parametrize("images", [9, 24, 61])
+def test_fir_filter_is_scipys_convolution(images):
+    packet = np.random.default_rng(0).standard_normal((2, images, 3, 4))
+    packet = packet[0] + 1j * packet[1]
+    exact = convolve(packet, FIRFilter().coefficients()[:, None, None], mode="valid")
+    np.testing.assert_allclose(FIRFilter().apply(torch.from_numpy(packet)).numpy(), exact, atol=1e-13)
 
 
 def test_polynomial_filter_removes_polynomials_and_has_its_response():

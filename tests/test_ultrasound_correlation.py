@@ -4,41 +4,107 @@ import numpy as np
 import pytest
 import torch
 
-from torchsph.ultrasound.correlation import KernelShape, correlate, image_pairs
+from torchsph.pairs.native import LibraryMissing, library
+from torchsph.ultrasound import backends
+from torchsph.ultrasound.correlation import KernelShape
+from torchsph.ultrasound.gridding import Gridding
 from torchsph.ultrasound.peak import find_peak
 
+try:
+    library()
+    COMPILED = ["cpu"]
+except LibraryMissing:
+    COMPILED = []
+BACKENDS = ["reference", *COMPILED]
 
-def random_volume(seed=0, dtype=torch.float64):
+
+def random_volume(seed=0, dtype=torch.float64, images=5):
     generator = torch.Generator().manual_seed(seed)
-    return torch.view_as_complex(torch.randn((20, 18, 16, 5, 2), generator=generator, dtype=dtype))
+    return torch.view_as_complex(torch.randn((20, 18, 16, images, 2), generator=generator, dtype=dtype))
 
 
-def test_correlation_equals_its_definition_at_every_lag():
-    volume, shape = random_volume(), KernelShape((2, 1, 1), (1, 2, 1))
-    corner, offset = torch.tensor([[4, 5, 5], [8, 6, 7]]), torch.tensor([[0, 0, 0], [1, -1, 2]])
-    ramp = torch.tensor([[0.3, 0.0, -0.2], [0.0, 0.1, 0.0]], dtype=torch.float64)
-    rho = correlate(image_pairs(volume, 2, shape.half), corner, offset, shape, ramp=ramp)
-    for point in range(2):
+@pytest.mark.parametrize("name", BACKENDS)
+@pytest.mark.parametrize(("dtype", "close"), [(torch.float64, 1e-12), (torch.float32, 1e-6)])
+@pytest.mark.parametrize("images", [3, 5, 19], ids="of {}".format)
+def test_correlation_equals_its_definition_at_every_lag(name, dtype, close, images):
+    volume, shape = random_volume(dtype=dtype, images=images), KernelShape((2, 1, 1), (1, 2, 1))
+    corner, offset = torch.tensor([[4, 5, 5], [8, 6, 7], [14, 13, 12]]), torch.tensor([[0, 0, 0], [1, -1, 2], [0] * 3])
+    ramp = torch.tensor([[0.3, 0.0, -0.2], [0.0, 0.1, 0.0], [0.0, 0.0, 0.0]], dtype=dtype)
+    rho = backends.backend(name).correlate(volume, 2, corner, offset, shape, ramp=ramp).numpy()
+    samples = volume.numpy().astype(np.complex128)
+    for point in range(3):
         z, y, x = corner[point].tolist()
-        place = [torch.arange(-h, h + 1, dtype=torch.float64) for h in shape.half]
-        turn = sum(g * n for g, n in zip(ramp[point], torch.meshgrid(*place, indexing="ij"), strict=True))
-        kernel = volume[z : z + 5, y : y + 3, x : x + 3, :-2] * torch.exp(2j * turn)[..., None]
+        place = [np.arange(-h, h + 1) for h in shape.half]
+        turn = sum(g * n for g, n in zip(ramp[point].tolist(), np.meshgrid(*place, indexing="ij"), strict=True))
+        kernel = samples[z : z + 5, y : y + 3, x : x + 3, :-2] * np.exp(2j * turn)[..., None]
         for lag in np.ndindex(*shape.lags):
             a, b, c = (
                 n + o + k - s
                 for n, o, k, s in zip((z, y, x), offset[point].tolist(), lag, shape.search, strict=True)
             )
-            other = volume[a : a + 5, b : b + 3, c : c + 3, 2:]
-            exact = (kernel.conj() * other).sum() / (kernel.norm() * other.norm())
-            assert abs(complex(rho[(point, *lag)]) - complex(exact)) < 1e-12
+            other = samples[a : a + 5, b : b + 3, c : c + 3, 2:]
+            exact = (kernel.conj() * other).sum() / (np.linalg.norm(kernel) * np.linalg.norm(other))
+            assert abs(rho[(point, *lag)] - exact) < close
 
 
-def test_a_silent_kernel_correlates_with_nothing():
+@pytest.mark.parametrize("name", BACKENDS)
+def test_a_silent_kernel_correlates_with_nothing(name):
     volume = torch.zeros((20, 18, 16, 3), dtype=torch.complex64)
-    shape = KernelShape((1,) * 3, (1,) * 3)
-    pairs = image_pairs(volume, 1, shape.half)
-    rho = correlate(pairs, torch.tensor([[5, 5, 5]]), torch.zeros((1, 3), dtype=torch.long), shape)
-    assert not rho.abs().any()
+    shape, still = KernelShape((1,) * 3, (1,) * 3), torch.zeros((1, 3), dtype=torch.long)
+    assert not backends.backend(name).correlate(volume, 1, torch.tensor([[5, 5, 5]]), still, shape).abs().any()
+
+
+@pytest.mark.skipif(not COMPILED, reason="no C++ compiler: there are no compiled sums to compare with torch's")
+@pytest.mark.parametrize(("dtype", "close"), [(torch.float64, 1e-12), (torch.float32, 1e-5)])
+def test_compiled_sums_over_images_and_boxes_are_those_of_torch(dtype, close):
+    images = random_volume(1, dtype, 6).movedim(-1, 0).conj()  # a view, its conjugate still to be taken
+    margin, half = (3, 2, 4), (2, 1, 3)
+    middle = torch.tensor([[3, 2, 4], [22, 19, 19], [12, 9, 12]])
+    found = []
+    for one in map(backends.backend, BACKENDS):
+        volume, power, turn = one.arrange(images, margin, turns=True)
+        found.append([
+            volume, power, turn, one.mean_power(images), one.box_sums(power, middle, half),
+            *(one.sums_around(turn, widths)(middle) for widths in (half, (0, 9, 5))),
+        ])  # fmt: skip
+    for compiled, reference in zip(found[1], found[0], strict=True):
+        torch.testing.assert_close(compiled, reference, atol=close, rtol=close)
+
+
+@pytest.mark.skipif(not COMPILED, reason="no C++ compiler: torch decides how its sums are split")
+def test_the_number_of_threads_changes_nothing():
+    sums, volume = backends.backend("cpu"), random_volume(dtype=torch.float32)
+    generator = torch.Generator().manual_seed(2)
+    corner, shape = torch.randint(4, 9, (40, 3), generator=generator), KernelShape((1,) * 3, (2,) * 3)
+    lattice, points = Gridding((0.0,) * 3, (1.0,) * 3, (9, 10, 11)), 12 * torch.rand((300, 3), generator=generator)
+    found, threads = [], torch.get_num_threads()
+    try:
+        for number in (1, 3):
+            torch.set_num_threads(number)
+            spread = lattice.spread(points, torch.polar(points[:, 0], points[:, 1]))
+            found.append([sums.correlate(volume, 1, corner, torch.zeros_like(corner), shape), spread])
+    finally:
+        torch.set_num_threads(threads)
+    assert all(torch.equal(one, three) for one, three in zip(*found, strict=True))
+
+
+def test_what_was_asked_for_by_name_and_is_missing_is_an_error(monkeypatch):
+    def missing():
+        raise LibraryMissing("no compiler here")
+
+    monkeypatch.setattr(backends, "library", missing)
+    assert backends.backend().name == "reference"
+    for arguments, message in ((("cpu",), "no compiler here"), (("cpu", "cuda"), "on 'cuda'"), (("gpu",), "unknown")):
+        with pytest.raises(ValueError, match=message):
+            backends.backend(*arguments)
+
+
+@pytest.mark.skipif(not COMPILED, reason="no C++ compiler: torch itself refuses nodes outside a volume")
+def test_kernels_outside_the_volume_are_refused():
+    volume, shape, still = random_volume(), KernelShape((1,) * 3, (1,) * 3), torch.zeros((1, 3), dtype=torch.long)
+    for corner in ([0, 5, 5], [5, 5, 13]):
+        with pytest.raises(IndexError, match="volume of"):
+            backends.backend("cpu").correlate(volume, 1, torch.tensor([corner]), still, shape)
 
 
 def gaussian_peak(curve, vertex, lags):

@@ -16,7 +16,7 @@ from torchsph.ultrasound.estimates import Estimates
 from torchsph.ultrasound.measurement import ScannerOptions, image_grid
 from torchsph.ultrasound.speckle_measurement import SpeckleOptions, measure_speckle
 from torchsph.ultrasound.tracking import SpeckleTracker
-from torchsph.ultrasound.training import TrainingPlan, calibrate, random_swirl, training_points
+from torchsph.ultrasound.training import TrainingPlan, calibrate, random_scene, random_swirl, training_points
 
 QUICK = SpeckleOptions(every=2, training=2, tissue=20.0, image_spacing=0.25e-3)
 
@@ -40,7 +40,7 @@ def estimates(count, generator, variance):
     one = torch.ones(count)
     return Estimates(
         torch.zeros((count, 3)), 0.9 * one, 2 * one, torch.ones((count, 3)),
-        variance[:, None].expand(-1, 3), 0 * one, 20 * one, 0 * one, 10 * one,
+        variance[:, None].expand(-1, 3), 0 * one, 20 * one, 0 * one, 10 * one, 0.01 * one,
         torch.ones(count, dtype=torch.long), torch.zeros(count, dtype=torch.int32),
     )  # fmt: skip
 
@@ -66,7 +66,7 @@ def test_a_tracker_that_tells_its_correlation_alone_is_calibrated_by_it():
     unknown = torch.full((4000,), torch.nan)
     found = estimates(4000, generator, unknown)
     correlation = 0.5 + 0.49 * torch.rand(4000, generator=generator)
-    names = ("peak_ratio", "power", "snr", "response", "shear")
+    names = ("peak_ratio", "power", "snr", "response", "shear", "bend")
     found = dataclasses.replace(found, correlation=correlation, **dict.fromkeys(names, unknown))
     true = (1 - correlation)[:, None].expand(-1, 3)
     beam = torch.tensor([[0.0, 0.0, 1.0]]).expand(4000, 3)
@@ -122,8 +122,10 @@ def test_speckle_measurement_of_a_recording(tmp_path):
     np.testing.assert_array_equal(measured.time, true.time[::2])
     np.testing.assert_array_equal(measured.mask, true.mask[::2])
     seen = measured.mask & (measured.weight > 0)
-    assert seen.sum() > 0.5 * measured.mask.sum()
     inner = interior(measured)
+    # beside the wall what is left of its echoes takes many estimates away, inside hardly any
+    assert seen.sum() > 0.4 * measured.mask.sum()
+    assert inner.sum() > 0.9 * binary_erosion(measured.mask, np.ones((1, 5, 5, 5), bool)).sum()
     error = (measured.velocity - true.velocity[::2]).transpose(1, 0, 2, 3, 4)[:, inner]
     assert np.median(np.abs(error), axis=1)[2] < 0.03 and np.median(np.abs(error), axis=1)[:2].max() < 0.15
     deviation = measured.sigma.transpose(1, 0, 2, 3, 4)[:, inner]
@@ -204,22 +206,17 @@ def test_a_beam_of_another_dimension_is_refused():
 
 @pytest.mark.slow
 def test_deviations_hold_in_each_third_of_the_weight_on_held_out_simulations():
-    """z-scores have deviations of 0.8 to 1.25 in every third of the weight, all components taken together and across.
-
-    Along the beam up to 1.6 is let pass: some percent of blood in shear layers and slow axial flow is off by many
-    of its small deviations. They also make twelve packets needed: with the first four the last third has 1.57.
-    """
-    model, tracker, spacing = EchoModel(), SpeckleTracker(max_snr=30.0), (1e-3 / 6,) * 3
-    calibration = calibrate(model, tracker, spacing, torch.Generator().manual_seed(0))
-    plan = TrainingPlan()
-    points = training_points(plan, (0.0,) * 3)
-    grid = geometry.Grid((-39 * spacing[0],) * 3, spacing, (79,) * 3)
+    """z-scores have deviations of 0.8 to 1.25 in every third of the weight: each component, and all together."""
+    model, spacing, plan = EchoModel(), (1e-3 / 6,) * 3, TrainingPlan()
+    tracker = SpeckleTracker(max_snr=26.0)
+    calibration = calibrate(model, tracker, spacing, torch.Generator().manual_seed(0), plan)
+    lattice = training_points(plan, (0.0,) * 3)
+    grid = geometry.Grid((-33 * spacing[0],) * 3, spacing, (67,) * 3)
     scores, weights = [], []
-    for seed, speed in enumerate((0.08, 0.12, 0.18, 0.25, 0.33, 0.4) * 2, 100):
+    for seed, speed in enumerate((0.08, 0.12, 0.18, 0.25, 0.33, 0.4) * 4, 100):
         generator = torch.Generator().manual_seed(seed)
-        flow = random_swirl(
-            (0.0,) * 3, plan.radius, speed, generator, waves=4, tissue_speed=plan.tissue_speed
-        )
+        flow = random_scene((0.0,) * 3, plan.half, speed, generator, tissue_speed=plan.tissue_speed)
+        points = lattice[flow.blood(lattice, 0.0)]
         found = tracker.track(simulate_packet(flow, grid, model, 0.0, generator), points)
         beam = model.beams.directions(points).float()
         score = (found.velocity - flow.velocity(points, 0.0)) / calibration.sigma(found, beam)
@@ -230,4 +227,4 @@ def test_deviations_hold_in_each_third_of_the_weight_on_held_out_simulations():
     # rows: thirds; columns: x, y, z and all together
     square = torch.stack([score[third].square().mean(0) for third in thirds])
     spread = torch.cat([square, square.mean(1, keepdim=True)], 1).sqrt()
-    assert (spread > 0.8).all() and (spread[:, [0, 1, 3]] < 1.25).all() and (spread[:, 2] < 1.6).all(), spread
+    assert (spread > 0.8).all() and (spread < 1.25).all(), spread

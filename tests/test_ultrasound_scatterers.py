@@ -8,7 +8,7 @@ import torch
 from test_ultrasound_noise import recording, uniform, vortex
 from ultrasound_cases import packet
 
-from torchsph.ultrasound.flow import LinearFlow, RecordingFlow
+from torchsph.ultrasound.flow import LinearFlow, RecordingFlow, refined
 from torchsph.ultrasound.scatterers import Box, Cloud, advance, carry, reseed, seed_cloud
 
 BOX = Box((-4e-3, -4e-3, -4e-3), (4e-3, 4e-3, 4e-3))
@@ -98,3 +98,15 @@ def test_boxes_and_densities_are_checked():
         Box((0.0, 0.0), (1.0, 0.0))
     with pytest.raises(ValueError, match="density"):
         seed_cloud(BOX, LinearFlow((0.0,) * 3), 0.0, 0.0, torch.Generator())
+
+
+def test_a_field_is_refined_as_quadratics_are():
+    """And the nodes keep their values, whatever the field."""
+    z, y, x = torch.meshgrid(*(torch.arange(n, dtype=torch.float64) for n in (5, 6, 7)), indexing="ij")
+    fine = torch.meshgrid(*(torch.arange(3 * n - 2, dtype=torch.float64) / 3 for n in (5, 6, 7)), indexing="ij")
+    found = refined((z * z - 2 * y * x + 3 * x)[None], 3)
+    true = fine[0] ** 2 - 2 * fine[1] * fine[2] + 3 * fine[2]
+    inner = (slice(3, -3),) * 3
+    torch.testing.assert_close(found[0][inner], true[inner], rtol=0, atol=1e-12)
+    rough = torch.rand((2, 4, 5), generator=torch.Generator().manual_seed(0))
+    torch.testing.assert_close(refined(rough, 3)[:, ::3, ::3], rough)

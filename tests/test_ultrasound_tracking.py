@@ -31,7 +31,7 @@ def test_uniform_motion_is_measured_within_the_stated_error(velocity):
         errors.append(found.velocity[found.accepted] - torch.tensor(velocity))
     error = torch.cat(errors)
     deviation = error.std(0)
-    assert (deviation[:2] < 0.022).all() and deviation[2] < 1.2e-3
+    assert (deviation[:2] < 0.02).all() and deviation[2] < 1.2e-3
     speed = math.hypot(*velocity)
     assert (error.mean(0).abs() < 0.01 * speed + 0.003).all()  # 375 points, some 60 of them independent
 
@@ -72,6 +72,18 @@ def test_the_tile_does_not_matter():
     torch.testing.assert_close(*parts, atol=1e-4, rtol=0)
 
 
+def test_compiled_sums_give_the_estimates_of_torch():
+    """With everything that goes into them: filter, shear, all lags, a rim cut off and a sample that is NaN."""
+    scene = packet((0.2, 0.1, 0.3), 11, gradient=((0, 0, 0), (0, 0, 0), (100.0, 0, 0)), dtype=torch.float64)
+    iq = scene.iq.clone()
+    iq[3, 30, 30, 30] = float("nan")
+    scene, points = scene.with_iq(iq, noise=scene.noise), lattice(half=3)
+    found, exact = (SpeckleTracker(backend=name).track(scene, points) for name in ("auto", "reference"))
+    assert torch.equal(found.flags, exact.flags) and torch.equal(found.lag, exact.lag)
+    for name in ("velocity", "correlation", "peak_ratio", "curvature", "variance", "power", "snr", "response", "shear"):
+        torch.testing.assert_close(getattr(found, name), getattr(exact, name), rtol=1e-7, atol=1e-9)
+
+
 def test_following_shear_halves_its_error():
     gradient = ((0, 0, 0), (0, 0, 0), (150.0, 0, 0))
     points = lattice()
@@ -86,7 +98,45 @@ def test_following_shear_halves_its_error():
             )
             off.append((found.velocity - true)[:, 0].abs())
         error[follow] = float(torch.cat(off).median())
-    assert error[True] < 0.6 * error[False]
+    assert error[True] < 0.5 * error[False]
+
+
+@pytest.mark.parametrize("gradient", [(60.0, 0, 0), (0, 100.0, 0), (0, 0, 50.0), (40.0, 40.0, -40.0)])
+def test_shear_is_told_to_some_per_cent(gradient):
+    scene = packet((0.2, 0.1, 0.25), gradient=((0, 0, 0), (0, 0, 0), gradient))
+    found = PLAIN.track(scene, lattice())
+    assert float(found.shear.median()) == pytest.approx(math.hypot(*gradient), rel=0.15)
+
+
+class Parabola:
+    """Axial flow 0.1 + 6e4 x^2 in blood everywhere."""
+
+    def velocity(self, points, time):
+        axial = 0.1 + 6e4 * points[:, 0].square()
+        return torch.stack([0 * axial, 0 * axial, axial], 1)
+
+    def blood(self, points, time):
+        return torch.ones(len(points), dtype=torch.bool)
+
+
+def test_a_bend_of_the_axial_flow_is_told():
+    """Half a kernel off, a parabola c x^2 is off its tangent by c h^2, on either side: 2 c h^2 off a straight line."""
+    axis = torch.arange(-3, 4, dtype=torch.float64) * 1e-3
+    points = torch.cartesian_prod(torch.zeros(1, dtype=torch.float64), axis, axis) + torch.tensor([0.0, 0.0, 24e-3])
+    scene = simulate_packet(Parabola(), cube(24), EchoModel(), 0.0, torch.Generator().manual_seed(0))
+    assert float(PLAIN.track(scene, points).bend.median()) == pytest.approx(2 * 6e4 * 0.5e-3**2, rel=0.3)
+
+
+def test_what_shear_leaves_of_the_correlation_is_believed():
+    """150/s leaves exp(-(0.25 ms 150/s k s)^2 / 4) = 0.86, k the phase per metre and s = 0.51 mm: below either gate."""
+    gradient = ((0, 0, 0), (0, 0, 0), (150.0, 0, 0))
+    scene, points = packet((0.2, 0.1, 0.2), gradient=gradient), lattice()
+    found = PLAIN.track(scene, points)
+    true = torch.tensor([0.2, 0.1, 0.2]) + torch.outer(points[:, 0].float(), torch.tensor([0, 0, 150.0]))
+    error = found.velocity - true
+    assert float(found.correlation.median()) == pytest.approx(0.86 / 1.01, abs=0.02)
+    assert found.accepted.float().mean() > 0.9 and (found.lag == 1).float().mean() > 0.9
+    assert error[found.accepted][:, 2].std() < 0.012 and error[found.accepted][:, :2].std() < 0.15
 
 
 # hard cases
@@ -203,6 +253,7 @@ def test_options_are_checked():
         ({"kernel": 0.0}, "kernel"),
         ({"lags": (2, 1)}, "lags"),
         ({"min_samples": 1}, "min_samples"),
+        ({"backend": "gpu"}, "backend"),
     ):
         with pytest.raises(ValueError, match=message):
             SpeckleTracker(**options)

@@ -69,6 +69,9 @@ def _assimilate(parser: Parser, presets: tuple[str, ...]) -> None:
     _model(parser, presets)
     parser.add_argument("--members", type=whole(2), metavar="N", help="size of the ensemble")
     parser.add_argument(
+        "--lag", type=whole(1), metavar="N", help="frames whose data still move the ensemble's earlier analyses (off)"
+    )
+    parser.add_argument(
         "--resume", action="store_true", help="go on with the ensemble where DIR/checkpoint.pt left it"
     )
     parser.add_argument(

@@ -49,6 +49,7 @@ def assimilate(args: argparse.Namespace) -> None:
             preset=args.preset,
             spacing=args.spacing,
             members=args.members,
+            lag=args.lag,
             also=also,
             truth=truth,
             checkpoints=saved,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -26,16 +27,18 @@ from .assimilation import (
 )
 from .ensemble_options import EnsembleOptions
 from .innovation_spline import InnovationSpline, Look
+from .lagged import Lagged, LaggedAnalyses
 from .members import Ensemble, Forecaster, Forecasts
 from .observing import Seen, Source
+from .parallel import from_last, is_last, shared
 from .perturbations import flow_perturbations
 from .regions import flow_regions
 from .smooth import FrameSmoother
 from .solenoidal import without_divergence
 from .ultrasound.fields import fwhm_to_deviation
 
-# share of the forecast's error variance that an analysis leaves at least
-_LEAST_LEFT = 0.25
+# draws from the ensemble whose splines tell how large its spread is: each costs a thirtieth of an analysis
+_DRAWS = 3
 
 
 class Cycle:
@@ -58,16 +61,18 @@ class Cycle:
         self.generator = torch.Generator().manual_seed(seed)
         self.augmentation = Augmentation(tuple(one.parameter for one in options.estimated))
         self.gain = LearnedGain(len(options.increments), self.grid.dimension, memory=options.memory)
-        self.spread = SpreadMatch()
+        self.spread = SpreadMatch(averaged=options.memory)
         self.first_group = np.cumsum([0] + [source.groups for source in self.sources]).tolist()
         self.scale = ErrorScale(self.first_group[-1], memory=options.memory)
         self.record = FilterRecord(seed=seed)
         self.spline = InnovationSpline(splines, options.choose_every)
+        self.lagged = None if options.lag is None else LaggedAnalyses(options.lag)
         self.offered: Tensor | None = None  # (J, D, *shape) increments of the last analysis
         self.fields: list[Tensor] = []
         self.sigmas: list[Tensor] = []
         self.missing: list[int] = []
         self.events: list[dict[str, Any]] = []
+        self.shocks: list[float] = []
         self.ensemble: Ensemble | None = None
 
     @property
@@ -80,17 +85,20 @@ class Cycle:
 
     def begin(self) -> None:
         """The first frame: its spline and draws from the spline's posterior; walls alone where it measured nothing."""
-        mask = self.mask(0)
-        if self.splines.measures(0):
-            fitted = self.splines.fit(0, uncertainty=True)
-            control = torch.from_numpy(self.splines.on_grid(fitted, 0))
-            draws = self.splines.draws(fitted, 0, self.count, self.generator).to(control.dtype)
-        else:
-            control = torch.zeros((self.grid.dimension, *self.grid.shape))
-            draws = self._perturbations(0, self.usual)
+        mask, generator = self.mask(0), self._forked()
+        [(control, draws)] = shared([partial(self._first, generator)])
         parameters = {one.parameter.name: one.draw(self.count, self.generator) for one in self.options.estimated}
         self.ensemble = Ensemble(control, control + draws, parameters).centred()
         self._keep(control, torch.where(mask, self.ensemble.members.std(0), 0.0), 0)
+
+    def _first(self, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        """The first control (D, *shape), and deviations of the members (N, D, *shape)."""
+        if self.splines.measures(0):
+            fitted = self.splines.fit(0, uncertainty=True)
+            control = torch.from_numpy(self.splines.on_grid(fitted, 0))
+            return control, self.splines.draws(fitted, 0, self.count, generator).to(control.dtype)
+        control = torch.zeros((self.grid.dimension, *self.grid.shape))
+        return control, self._perturbations(0, self.usual, generator)
 
     def step(self, frame: int) -> None:
         """From the analysis of the frame before to that of ``frame``."""
@@ -102,9 +110,12 @@ class Cycle:
         ]
         times = sorted({time for _, _, time in seen if time < now - 1e-6}) + [now]
         masks = [early | late] * (len(times) - 1) + [late]
+        generator = self._forked()
+        noise = self._perturbations(frame, 1.0, generator) if is_last() and self.options.model_error > 0 else None
         forecasts = self.forecaster.advance(self.ensemble, before, early, times, masks)
-        states = self._prepared(forecasts, frame)
-        look = self._look([(source, what, _nearest(times, time)) for source, what, time in seen], states, masks, frame)
+        self.shocks.append(forecasts.shock)
+        states = self._prepared(forecasts, from_last(noise), frame)
+        look = self._look([(source, what, _nearest(times, time)) for source, what, time in seen], states, masks)
         missing = int((late & ~forecasts.covered).sum())
         if look is None:
             self.offered = None
@@ -114,16 +125,20 @@ class Cycle:
 
     # --- forecast -------------------------------------------------------------------------------------
 
-    def _perturbations(self, frame: int, amplitude: float) -> Tensor:
+    def _perturbations(self, frame: int, amplitude: float, generator: torch.Generator | None = None) -> Tensor:
         length = self.options.length
         if length is None:
             length = max(fwhm_to_deviation(self.sources[0].kernel), float(np.mean(self.grid.spacing)))
         return flow_perturbations(
-            self.count, np.array(self.measured.mask[frame], bool), self.grid.spacing, amplitude, length, self.generator
+            self.count, np.array(self.measured.mask[frame], bool), self.grid.spacing, amplitude, length,
+            generator or self.generator,
         ).to(torch.float32)
 
-    def _prepared(self, forecasts: Forecasts, frame: int) -> list[Ensemble]:
-        """Forecasts with failed members replaced, model error added, and the spread that the innovations ask for."""
+    def _prepared(self, forecasts: Forecasts, noise: Tensor | None, frame: int) -> list[Ensemble]:
+        """Forecasts with failed members replaced, model error added, and the spread that the innovations ask for.
+
+        ``noise`` (N, D, *shape): the model error's perturbations, of RMS 1.
+        """
         states, time = forecasts.states, float(self.measured.time[frame])
         if forecasts.control_failed:
             self.events.append({"time": time, "failed": "control", "donor": "mean of the members"})
@@ -131,11 +146,10 @@ class Cycle:
             states = self._replaced(states, forecasts.failed, frame)
         mask = self.mask(frame)
         rms = max(float(states[-1].control[:, mask].square().mean().sqrt()), self.usual)
-        share = self.options.model_error
-        noise = self._perturbations(frame, share * rms) if share > 0 else 0.0
+        error = 0.0 if noise is None else self.options.model_error * rms * noise
         prepared = []
         for state in states:
-            anomalies = state.members - state.members.mean(0) + noise
+            anomalies = state.members - state.members.mean(0) + error
             prepared.append(replace(state, members=state.control + self.spread.factor * anomalies))
         return prepared
 
@@ -145,17 +159,21 @@ class Cycle:
         if int((~failed).sum()) < 2:  # too few to draw from: a new ensemble around the control
             fresh = self._perturbations(frame, self.usual)
             members = torch.stack([state.control + fresh for state in states], 1)
+            if self.lagged is not None:
+                self.lagged.clear()
             self.events.append({"time": time, "failed": torch.nonzero(failed).flatten().tolist(), "donor": "control"})
         else:
             repaired = replace_failed(members.flatten(1), failed, self.generator)
             members = repaired.ensemble.reshape(members.shape)
             self.events += [{"time": time, "failed": e.member, "donor": e.donor} for e in repaired.events]
+            for event in repaired.events if self.lagged is not None else ():
+                self.lagged.replaced(event.member, event.donor)
         return [replace(state, members=members[:, k]) for k, state in enumerate(states)]
 
     # --- observations ---------------------------------------------------------------------------------
 
     def _look(
-        self, parts: list[tuple[Source, Seen, int]], states: list[Ensemble], masks: list[Tensor], frame: int
+        self, parts: list[tuple[Source, Seen, int]], states: list[Ensemble], masks: list[Tensor]
     ) -> Look | None:
         parts = [part for part in parts if len(part[1].position)]
         if not parts:
@@ -166,7 +184,7 @@ class Cycle:
         ])  # fmt: skip
         observations = self.scale.apply(concatenate([seen.observations for _, seen, _ in parts]), group)
         members = torch.cat([source.predict(states[k].members, masks[k], seen) for source, seen, k in parts], 1)
-        return Look(parts, observations, group, members, self._regions(parts, states[-1].control, frame))
+        return Look(parts, observations, group, members)
 
     def _regions(self, parts: list[tuple[Source, Seen, int]], control: Tensor, frame: int) -> dict[str, Tensor]:
         surface = self.splines.motion.surface(float(self.measured.time[frame]))
@@ -192,20 +210,29 @@ class Cycle:
         if state.parameters:
             joint = self.augmentation.join(forecast, state.parameters)
             positions = self.augmentation.positions(positions, size)
-        analysis = self.filter.analyse(
-            joint, look.members, look.observations, state_positions=positions, generator=self.generator
-        )
-        self._record(analysis, look, forecast, inside, frame)
-        weight = self._weights(analysis, look)
+        screened = self.filter.screen(joint, look.members, look.observations)
+        weight = torch.where(screened.used, 1.0 / screened.variance, 0.0)
         if self.offered is not None:
-            self.gain.learn(self._seen(self.offered, masks, look), torch.nan_to_num(analysis.innovation), weight)
-        self.offered = self._increments(analysis, look, inside, state.control, frame)
+            self.gain.learn(self._seen(self.offered, masks, look), screened.innovation, weight)
+        drawn = self._drawn(look)
+        tasks = [
+            partial(self._splines, torch.cat([screened.innovation[None], drawn]), weight, look, frame),
+            partial(self._filtered, joint, look, positions, state.control, frame, inside, self._forked()),
+        ]
+        (found, choice), (analysis, regions, earlier) = shared(tasks)
+        if self.lagged is not None:
+            self._take_earlier(earlier)
+        self.spline.restore(choice)
+        look = replace(look, regions=regions)
+        self._record(analysis, look, forecast, inside, frame)
+        self.offered = self._increments(analysis, found, inside, state.control, frame)
         change = torch.einsum("j,jd...->d...", self.gain.weight.to(torch.float32), self.offered)
-        self._match_spread(masks, look, weight, frame)
+        self._match_spread(masks, look, weight > 0, drawn, found)
         self.scale.learn(analysis, look.observations, look.group)
         control = state.control + change
         anomalies, parameters = self._on_grid(analysis.ensemble[:, :size] - analysis.mean[:size], inside), {}
-        left = self._left(look, self._seen(anomalies, masks, look), self._seen(change[None], masks, look)[0], weight)
+        before, after = (float(part.double().var(0).sum()) for part in (forecast, analysis.ensemble[:, :size]))
+        left = self.spread.left(before, after, float(change[:, mask].double().square().sum()))
         anomalies = left * anomalies
         if state.parameters:
             _, parameters = self.augmentation.split(analysis.ensemble)
@@ -213,12 +240,32 @@ class Cycle:
         sigma = left * self._on_grid(analysis.variance[:size].clamp_min(0).sqrt()[None], inside)[0]
         self._keep(torch.where(mask, control, 0.0), sigma, missing)
 
-    def _weights(self, analysis: Analysis, look: Look) -> Tensor:
-        """(m,) inverse variances of the observations in use, 0 for the others; no place counts for another."""
-        used = (analysis.reason == Reason.USED) | (analysis.reason == Reason.OUT_OF_REACH)
-        variance = look.observations.variance.double()
-        fine = used & torch.isfinite(analysis.innovation) & torch.isfinite(variance)
-        return torch.where(fine, 1.0 / variance, 0.0)
+    def _splines(self, values: Tensor, weight: Tensor, look: Look, frame: int) -> tuple[Tensor, dict[str, Any] | None]:
+        """The splines (k, D, *shape) of numbers (k, m), k = 0 where none are used, and what is remembered of them."""
+        if "spline" not in self.options.increments:
+            return torch.zeros((0, self.grid.dimension, *self.grid.shape)), None
+        return self.spline.of(values, weight, look, frame), self.spline.state()
+
+    def _filtered(
+        self, joint: Tensor, look: Look, positions: Tensor, control: Tensor, frame: int, inside: Tensor,
+        generator: torch.Generator,
+    ) -> tuple[Analysis, dict[str, Tensor], list[Lagged]]:
+        """The filter's analysis, without its map of the members, which is large and has served; regions; the past."""
+        analysis = self.filter.analyse(
+            joint, look.members, look.observations, state_positions=positions, generator=generator
+        )
+        numbers = self.grid.dimension * len(inside)
+        earlier = [] if self.lagged is None else self.lagged.improved(analysis, inside, numbers)
+        return replace(analysis, transform=None), self._regions(look.parts, control, frame), earlier
+
+    def _forked(self) -> torch.Generator:
+        """A generator of its own for what one process alone may do."""
+        return torch.Generator().manual_seed(int(torch.randint(2**62, (), generator=self.generator)))
+
+    def _drawn(self, look: Look) -> Tensor:
+        """(_DRAWS, m) draws from the ensemble's deviations as they are observed."""
+        draw = torch.randn((_DRAWS, self.count), generator=self.generator, dtype=torch.float64)
+        return draw @ torch.nan_to_num(look.members - look.members.mean(0)).double() / (self.count - 1) ** 0.5
 
     def _seen(self, fields: Tensor, masks: list[Tensor], look: Look) -> Tensor:
         """(J, m) fields (J, D, *shape) where they are observed; 0 where nothing of them is."""
@@ -227,46 +274,37 @@ class Cycle:
         )
 
     def _increments(
-        self, analysis: Analysis, look: Look, inside: Tensor, control: Tensor, frame: int
+        self, analysis: Analysis, found: Tensor, inside: Tensor, control: Tensor, frame: int
     ) -> Tensor:
         """(J, D, *shape) increments, each with one component alone, in the order of ``options.increments``."""
         parts = self.grid.dimension
-        found = []
+        offered = []
         for name in self.options.increments:
             if name == "ensemble":
                 size = parts * len(inside)
                 moved = self._on_grid(analysis.mean[None, :size], inside)[0]
                 whole = torch.where(self.mask(frame), moved - control, 0.0)
             else:
-                innovation = torch.nan_to_num(analysis.innovation)
-                whole = self.spline.of(innovation, self._weights(analysis, look), look, frame)
-            found.append(torch.diag_embed(whole.movedim(0, -1)).movedim((-2, -1), (0, 1)))
-        return torch.cat(found)
+                whole = found[0]
+            offered.append(torch.diag_embed(whole.movedim(0, -1)).movedim((-2, -1), (0, 1)))
+        return torch.cat(offered)
 
-    def _left(self, look: Look, anomalies: Tensor, change: Tensor, weight: Tensor) -> float:
-        """Factor on the analysed anomalies, seen (N, m), that leaves them what the analysis left of the error.
+    def _match_spread(
+        self, masks: list[Tensor], look: Look, used: Tensor, drawn: Tensor, found: Tensor
+    ) -> None:
+        """Compare what splines (1 + k, D, *shape) find in the innovations and in draws from the ensemble (k, m).
 
-        With weights that make the innovations white the error's variance falls by the increment's own; the filter
-        believes that it did more, because it takes its own increment for the one that was followed.
+        Every observation in use counts alike: the spread stands for the error of the whole state, most of which lies
+        where the observations are worst, in jets and shear.
         """
-        before = float((weight * look.members.double().var(0)).nan_to_num().sum())
-        after = float((weight * anomalies.double().var(0)).sum())
-        taken = float((weight * change.double().square()).sum())
-        target = max(before - taken, _LEAST_LEFT * before)
-        return (target / after) ** 0.5 if after > 0 else 1.0
-
-    def _match_spread(self, masks: list[Tensor], look: Look, weight: Tensor, frame: int) -> None:
-        """Compare what the spline finds in the innovations with what it finds in one draw from the ensemble."""
-        if "spline" not in self.options.increments:
+        if not len(found):
             return
         parts, first = self.grid.dimension, self.options.increments.index("spline") * self.grid.dimension
         seen = self._seen(self.offered, masks, look)
         followed = self.gain.weight @ seen
-        shown = float((weight * seen[first : first + parts].sum(0) * followed).sum())
-        draw = torch.randn(self.count, generator=self.generator, dtype=torch.float64) / (self.count - 1) ** 0.5
-        anomaly = draw @ torch.nan_to_num(look.members - look.members.mean(0)).double()
-        found = self.spline.of(anomaly, weight, look, frame, learning=True)
-        self.spread.learn(shown, float((weight * self._seen(found[None], masks, look)[0] * anomaly).sum()))
+        shown = float((seen[first : first + parts].sum(0) * followed)[used].sum())
+        own = float((self._seen(found[1:], masks, look) * drawn)[:, used].sum()) / len(drawn)
+        self.spread.learn(shown, own)
 
     def _coast(self, state: Ensemble, mask: Tensor, missing: int, time: float) -> None:
         """Nothing was measured: the forecast is the analysis."""
@@ -286,7 +324,7 @@ class Cycle:
             time, analysis, look.observations, regions=look.regions,
             forecast=None if right is None else forecast, truth=right,
         )
-        if not bool((self._weights(analysis, look) > 0).any()):
+        if not bool(torch.isin(analysis.reason, torch.tensor([Reason.USED, Reason.OUT_OF_REACH])).any()):
             self.events.append({"time": time, "coasted": True})
 
     def _on_grid(self, values: Tensor, inside: Tensor) -> Tensor:
@@ -296,11 +334,25 @@ class Cycle:
         return full.reshape(len(values), self.grid.dimension, *self.grid.shape)
 
     def _keep(self, control: Tensor, sigma: Tensor, missing: int) -> None:
-        mask = np.array(self.measured.mask[len(self.fields)], bool)
-        clean = without_divergence(control.numpy(), mask, self.grid.spacing)
-        self.fields.append(torch.from_numpy(clean).to(torch.float32))
+        if self.lagged is not None:
+            self.lagged.add(self.done, control, self.ensemble.members - self.ensemble.control, sigma)
+        self.fields.append(self._clean(control, self.done))
         self.sigmas.append(sigma.to(torch.float32))
         self.missing.append(missing)
+
+    def _take_earlier(self, earlier: list[Lagged]) -> None:
+        self.lagged.take(earlier)
+        for one in earlier:
+            mask = self.mask(one.frame)
+            self.fields[one.frame] = self._clean(torch.where(mask, one.control, 0.0), one.frame)
+            self.sigmas[one.frame] = one.sigma
+
+    def _clean(self, control: Tensor, frame: int) -> Tensor:
+        mask = np.array(self.measured.mask[frame], bool)
+        found = without_divergence(control.numpy(), mask, self.grid.spacing)
+        if not found.converged:
+            self.events.append({"time": float(self.measured.time[frame]), "divergence_left": found.left})
+        return torch.from_numpy(found.velocity).to(torch.float32)
 
     def state(self) -> dict[str, Any]:
         """Everything that the next step depends on, as tensors and plain values."""
@@ -310,7 +362,8 @@ class Cycle:
             "generator": self.generator.get_state(), "gain": self.gain.state(), "spread": self.spread.state(),
             "scale": self.scale.state(), "record": self.record.state(), "spline": self.spline.state(),
             "offered": self.offered, "fields": list(self.fields), "sigmas": list(self.sigmas),
-            "missing": list(self.missing), "events": list(self.events),
+            "missing": list(self.missing), "events": list(self.events), "shocks": list(self.shocks),
+            "lagged": [] if self.lagged is None else self.lagged.state(),
         }  # fmt: skip
 
     def restore(self, state: dict[str, Any]) -> None:
@@ -320,7 +373,9 @@ class Cycle:
             getattr(self, name).restore(state[name])
         self.offered = state["offered"]
         self.fields, self.sigmas = list(state["fields"]), list(state["sigmas"])
-        self.missing, self.events = list(state["missing"]), list(state["events"])
+        self.missing, self.events, self.shocks = (list(state[name]) for name in ("missing", "events", "shocks"))
+        if self.lagged is not None:
+            self.lagged.restore(state["lagged"])
 
 
 def _nearest(times: list[float], time: float) -> int:

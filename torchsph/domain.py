@@ -128,8 +128,14 @@ class Domain:
         inner = sorted(t for t in times if start + tolerance < t < stop - tolerance)
         return [*inner, stop] if stop > start else []
 
-    def enter(self, start: float, stop: float, *, shut: bool = False) -> None:
-        """Choose key frames and open valves for an interval without breaks inside; ``shut`` closes every valve."""
+    def enter(
+        self, start: float, stop: float, *, shut: bool = False, valve_strength: float | Tensor = 1.0
+    ) -> None:
+        """Choose key frames and open valves for an interval without breaks inside; ``shut`` closes every valve.
+
+        ``valve_strength``: of the run that goes through it, a number or (members,).
+        """
+        self.valve_strength = valve_strength
         middle = 0.5 * (start + stop)
         self._open = ()
         if self.scheme.valve is not None and not shut:
@@ -203,7 +209,7 @@ class Domain:
         total = self._gravity(particles)
         push = None
         if self.sources is not None:
-            push = self.sources.acceleration(particles, self._open, self.time_of(particles))
+            push = self.sources.acceleration(particles, self._open, self.time_of(particles), self.valve_strength)
         if push is None or total is None:
             return total if push is None else push
         return total + push

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -22,6 +24,9 @@ from .observation_error import ObservationError, estimate_error
 from .observing import Source
 from .simulator import Simulator
 from .smooth import FrameSmoother, smooth_frames
+
+# a deviation of the observation errors this many times the stated one is worth a warning
+_NOISY = 2.0
 
 
 @dataclass(frozen=True)
@@ -164,10 +169,51 @@ def _accounts(cycle: Cycle) -> dict[str, Any]:
         name: {"mean": float(row.mean()), "deviation": float(row.std())}
         for name, row in cycle.ensemble.parameters.items()
     }
+    kept = cycle.record.summary()
+    kept["warnings"] = kept["warnings"] + _noisier(cycle)
     return {
-        "members": cycle.count, "replaced_members": replaced, "events": cycle.events,
+        "members": cycle.count, "replaced_members": replaced, "events": cycle.events, "shocks": _shocks(cycle),
+        "divergence_not_converged": _divergent(cycle),
         "coasted_frames": sum(1 for event in cycle.events if "coasted" in event),
         "gain": dict(zip(cycle.options.increments, weights, strict=True)), "spread_factor": cycle.spread.factor,
         "observation_error_scale": cycle.scale.factor.tolist(), "kernel": [one.kernel for one in cycle.sources],
-        "estimated": learned, "filter": cycle.record.summary(), "options": repr(cycle.options),
+        "estimated": learned, "filter": kept, "options": repr(cycle.options),
     }  # fmt: skip
+
+
+def _divergent(cycle: Cycle) -> int:
+    """The number of analyses whose divergence was not removed as asked for; warns of them."""
+    left = [event["divergence_left"] for event in cycle.events if "divergence_left" in event]
+    if left:
+        warnings.warn(
+            f"removing the divergence did not converge in {len(left)} analyses (of the divergence up to "
+            f"{max(left):.2g} is left); 1 means that the field was left alone", RuntimeWarning, stacklevel=4,
+        )  # fmt: skip
+    return len(left)
+
+
+def _noisier(cycle: Cycle) -> list[str]:
+    """In words, which components of which measurements are far noisier than their error models say."""
+    words = []
+    for number, (source, first) in enumerate(zip(cycle.sources, cycle.first_group, strict=False)):
+        name = "the measurement" if number == 0 else f"further measurement {number}"
+        for part in range(source.groups):
+            times = float(cycle.scale.factor[first + part]) ** 0.5
+            what = "" if source.groups == 1 else f" in {'xyz'[part]}"
+            if times > _NOISY:
+                words.append(
+                    f"{name} is {times:.2g} times as noisy{what} as its errors say; it was trusted that much less"
+                )
+    return words
+
+
+def _shocks(cycle: Cycle) -> list[dict[str, float | None]]:
+    """How abrupt each analysis was for the particles that took it up: the part of their velocities that they lost.
+
+    It is what was divergent, or went through a wall: RMS, relative to the flow's. None where a scheme does not project.
+    """
+    starts = cycle.measured.time[: len(cycle.shocks)].tolist()
+    return [
+        {"time": time, "shock": shock if math.isfinite(shock) else None}
+        for time, shock in zip(starts, cycle.shocks, strict=True)
+    ]

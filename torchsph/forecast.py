@@ -49,6 +49,11 @@ class GridForecast:
     Args:
         model: the simulator. grid, mask (*shape) bool: where the velocity is known at ``time`` (s).
         velocity: (D, *shape) for one member or (members, D, *shape), m/s.
+
+    Attributes:
+        run: the simulation.
+        shock: (members,) what the projection took from the imposed velocities (``Simulation.project``): how far the
+            start is from a flow that the walls and the incompressible fluid allow. NaN where nothing is projected.
     """
 
     def __init__(
@@ -59,8 +64,9 @@ class GridForecast:
         self.grid, self.transfer, self.start_time = grid, transfer, time
         self.run: Simulation = model.start(time, members=batched.shape[0], seed=seed)
         self.run.impose(grid, batched, mask)
+        self.shock = torch.full((len(batched),), math.nan, dtype=torch.float64)
         if transfer.projections and self.run.can_project:
-            self.run.project(transfer.projections)
+            self.shock = self.run.project(transfer.projections).cpu()
         self._lost: Tensor | None = None
         if transfer.fade is not None:
             kept = self.run.fetch(grid, mask)

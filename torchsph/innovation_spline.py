@@ -51,46 +51,54 @@ class InnovationSpline:
     def restore(self, state: dict[str, Any] | None) -> None:
         self.choice = None if state is None else regularize.Choice(**state)
 
-    def of(self, value: Tensor, weight: Tensor, look: Look, frame: int, *, learning: bool = False) -> Tensor:
-        """(D, *shape) the spline of numbers (m,) at the observations of positive weight (m,).
+    def of(self, values: Tensor, weight: Tensor, look: Look, frame: int) -> Tensor:
+        """(k, D, *shape) splines of numbers (k, m) at the observations of positive weight (m,).
 
-        ``learning``: with the noise and smoothness that are in use, which stay.
+        Noise, smoothness and outliers are judged by the first row; of the others the same linear estimate is made.
         """
-        dimension, grid = self.splines.recording.dimension, self.splines.recording.grid
-        rows = _rows(value, weight, look)
+        rows = _rows(values, weight, look)
         if not rows:
-            return torch.zeros((dimension, *grid.shape))
-        full = [row for row in rows if row[0].beam is None]
-        anew = not learning and ((frame - 1) % self.choose_every == 0 or self.choice is None)
+            recording = self.splines.recording
+            return torch.zeros((len(values), recording.dimension, *recording.grid.shape))
+        full, choice, fitted = [row for row in rows if row[0].beam is None], None, []
         if full:
             each = [(seen.position[good], some, seen.confidence[good]) for seen, some, good in full]
-            points, samples, confidence = (torch.cat(parts) for parts in zip(*each, strict=True))
-            fitted = self.splines.fit_increment(
-                frame, points, samples, confidence, choice=None if anew else self.choice
+            points, samples, confidence = zip(*each, strict=True)
+            anew = (frame - 1) % self.choose_every == 0
+            fitted = self.splines.fit_increments(
+                frame, torch.cat(points), torch.cat(samples, 1), torch.cat(confidence),
+                choice=None if anew else self.choice,
             )
-            self.choice = self.choice if learning else fitted.choice
+            self.choice = choice = fitted[0].choice
         if len(full) < len(rows):
-            robust = fitted.choice.robust if full and fitted.choice is not None else None
-            choice = self.choice if full else None
-            points, samples, deviation, beams, known = _along_beams(rows, dimension, choice, robust)
-            confidence = (deviation.quantile(0.05) / deviation).clamp(_LEAST_CONFIDENCE, 1.0)
-            # the penalties keep their own precision where more is known of the samples
-            more = float((deviation[known] ** -2).sum() / (deviation**-2).sum())
-            if choice is not None:
-                slip = None if choice.no_slip is None else choice.no_slip * more**0.5
-                choice = replace(choice, curvature=choice.curvature * more**0.25, no_slip=slip)
-            fitted = self.splines.fit_increment(frame, points, samples, confidence, beam=beams, choice=choice)
-        return torch.from_numpy(self.splines.on_grid(fitted, frame))
+            fitted = self._along(rows, choice, frame)
+        return torch.stack([torch.from_numpy(self.splines.on_grid(one, frame)) for one in fitted])
+
+    def _along(
+        self, rows: list[tuple[Seen, Tensor, Tensor]], choice: regularize.Choice | None, frame: int
+    ) -> list[regularize.SplineField]:
+        """Splines of components along beams, with full vectors among them as three of those each."""
+        robust = None if choice is None else choice.robust
+        dimension = self.splines.recording.dimension
+        points, samples, deviation, beams, known = _along_beams(rows, dimension, choice, robust)
+        confidence = (deviation.quantile(0.05) / deviation).clamp(_LEAST_CONFIDENCE, 1.0)
+        # the penalties keep their own precision where more is known of the samples
+        more = float((deviation[known] ** -2).sum() / (deviation**-2).sum())
+        if choice is not None:
+            slip = None if choice.no_slip is None else choice.no_slip * more**0.5
+            choice = replace(choice, curvature=choice.curvature * more**0.25, no_slip=slip)
+        return [self.splines.fit_along(frame, points, one, confidence, beams, choice) for one in samples]
 
 
-def _rows(value: Tensor, weight: Tensor, look: Look) -> list[tuple[Seen, Tensor, Tensor]]:
-    """What each source says (n, parts) at its good places, and which those are (q,); sources without any left out."""
+def _rows(values: Tensor, weight: Tensor, look: Look) -> list[tuple[Seen, Tensor, Tensor]]:
+    """What each source says (k, n, parts) at its good places, and which those are (q,); sources with none left out."""
     start, rows = 0, []
     for _, seen, _ in look.parts:
         m = len(seen.observations)
         good = (weight[start : start + m].reshape(seen.parts, -1) > 0).all(0)
         if bool(good.any()):
-            rows.append((seen, value[start : start + m].reshape(seen.parts, -1).T[good], good))
+            own = values[:, start : start + m].reshape(len(values), seen.parts, -1)
+            rows.append((seen, own.transpose(1, 2)[:, good], good))
         start += m
     return rows
 
@@ -100,7 +108,7 @@ def _along_beams(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Samples of all sources as components along unit vectors.
 
-    Returns points (n, D), velocities (n, D), white-equivalent deviations (n,), unit vectors (n, D), and which samples
+    Returns points (n, D), velocities (k, n, D), white-equivalent deviations (n,), unit vectors (n, D), and which rows
     (n,) are parts of full vectors. Those have the noise of ``choice`` and, in their order, the factors ``robust``.
     """
     points, samples, beams, deviations, known, start = [], [], [], [], [], 0
@@ -118,8 +126,8 @@ def _along_beams(
             if seen.beam is None and choice is not None:
                 own = choice.noise[part] / (seen.confidence[good] * factor.sqrt())
             points.append(seen.position[good])
-            samples.append(value[:, part : part + 1] * beam)
+            samples.append(value[..., part : part + 1] * beam)
             beams.append(beam / beam.norm(dim=1, keepdim=True).clamp_min(1e-12))
             deviations.append(own)
             known.append(torch.full((count,), seen.beam is None))
-    return torch.cat(points), torch.cat(samples), torch.cat(deviations), torch.cat(beams), torch.cat(known)
+    return torch.cat(points), torch.cat(samples, 1), torch.cat(deviations), torch.cat(beams), torch.cat(known)

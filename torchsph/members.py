@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import torch
 import torch.distributed as dist
@@ -47,6 +48,7 @@ class Forecasts:
         states: one ensemble per time. covered: (*shape) bool at the last time, of the control.
         failed: (N,) bool. control_failed: the members' mean then stands for the control.
         steps: of all runs of this process together.
+        shock: what the projection had to take from the control's start, relative (``GridForecast.shock``).
     """
 
     states: list[Ensemble]
@@ -54,6 +56,7 @@ class Forecasts:
     failed: Tensor
     control_failed: bool
     steps: int
+    shock: float
 
 
 def shares(members: int, control_cost: float, processes: int, batch: int = 1) -> list[tuple[bool, slice]]:
@@ -103,11 +106,11 @@ class Forecaster:
         lead, mine = todo[rank]
         here = (start, mask, times, masks)
         run = self._members(ensemble, mine, *here)
-        control, covered, steps = None, None, run[1]
+        own, steps = None, run[1]
         if lead:
-            control, covered, more = self._control(ensemble, *here)
+            *own, more = self._control(ensemble, *here)
             steps += more
-        fields, control, covered = self._gathered(ensemble, run[0], control, covered, len(times), todo)
+        fields, control, covered, shock = self._gathered(ensemble, run[0], own, len(times), todo)
         failed = ~torch.isfinite(fields).flatten(2).all(2).all(0)
         lost = not bool(torch.isfinite(control).all())
         if lost:
@@ -115,7 +118,7 @@ class Forecaster:
                 raise NumericalFailure(f"the control and all {count} members failed after {start:g} s")
             control = fields[:, ~failed].mean(1)
         states = [Ensemble(control[k], fields[k], ensemble.parameters) for k in range(len(times))]
-        return Forecasts(states, covered, failed, lost, steps)
+        return Forecasts(states, covered, failed, lost, steps, shock)
 
     def _members(
         self, ensemble: Ensemble, mine: slice, start: float, mask: Tensor, times: Sequence[float],
@@ -127,7 +130,7 @@ class Forecaster:
         for first in range(mine.start, mine.stop, self.batch):
             these = slice(first, min(first + self.batch, mine.stop))
             parameters = {name: row[these] for name, row in ensemble.parameters.items()}
-            found, _, failed, steps = self._run(
+            found, _, failed, _, steps = self._run(
                 self.coarse, ensemble.members[these], parameters, start, mask, times, masks
             )
             done.append(torch.where(failed.reshape(1, -1, *[1] * (found.ndim - 2)), torch.nan, found))
@@ -136,19 +139,19 @@ class Forecaster:
 
     def _control(
         self, ensemble: Ensemble, start: float, mask: Tensor, times: Sequence[float], masks: Sequence[Tensor]
-    ) -> tuple[Tensor, Tensor, int]:
-        """(times, D, *shape) of the control, NaN where it failed; what it covers at the end; and the steps taken."""
+    ) -> tuple[Tensor, Tensor, float, int]:
+        """(times, D, *shape) of the control, NaN where it failed; what it covers at the end; its shock; its steps."""
         middle = {name: row.mean()[None] for name, row in ensemble.parameters.items()}
-        found, covered, failed, steps = self._run(
+        found, covered, failed, shock, steps = self._run(
             self.model, ensemble.control[None], middle, start, mask, times, masks
         )
-        return torch.where(failed[0], torch.nan, found[:, 0]), covered[0], steps
+        return torch.where(failed[0], torch.nan, found[:, 0]), covered[0], float(shock[0]), steps
 
     def _run(
         self, model: Simulator, states: Tensor, parameters: Mapping[str, Tensor], start: float, mask: Tensor,
         times: Sequence[float], masks: Sequence[Tensor],
-    ) -> tuple[Tensor, Tensor, Tensor, int]:
-        """Grids (times, k, D, *shape), covered (k, *shape), failed (k,) and the steps taken."""
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor, int]:
+        """Grids (times, k, D, *shape), covered (k, *shape), failed (k,), shocks (k,) and the steps taken."""
         going = GridForecast(
             model, self.grid, states.to(model.device), mask.to(model.device), start, self.transfer, seed=self.seed
         )
@@ -163,26 +166,31 @@ class Forecaster:
         except NumericalFailure:  # nobody is left; what was fetched before stays unused as well
             found = [torch.full_like(states, torch.nan)] * len(times)
         steps = int(record.steps.sum())
-        return torch.stack(found), covered.cpu(), record.failed.cpu(), steps
+        return torch.stack(found), covered.cpu(), record.failed.cpu(), going.shock, steps
 
     @staticmethod
     def _gathered(
-        ensemble: Ensemble, own: Tensor, control: Tensor | None, covered: Tensor | None, times: int,
-        todo: list[tuple[bool, slice]],
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """All members (times, N, ...), the control (times, ...) and its cover, the same in every process."""
+        ensemble: Ensemble, members: Tensor, control: list[Any] | None, times: int, todo: list[tuple[bool, slice]]
+    ) -> tuple[Tensor, Tensor, Tensor, float]:
+        """All members (times, N, ...), the control (times, ...), its cover and its shock, the same in every process.
+
+        ``members`` (times, k, ...): of this process. ``control``: the three of them, in the process that ran it.
+        """
         if len(todo) == 1:
-            return own, control, covered
+            return members, *control
         counts = [part.stop - part.start for _, part in todo]
-        padded = own.new_zeros((max(counts), *own.transpose(0, 1).shape[1:]))
-        padded[: own.shape[1]] = own.transpose(0, 1)
+        padded = members.new_zeros((max(counts), *members.transpose(0, 1).shape[1:]))
+        padded[: members.shape[1]] = members.transpose(0, 1)
         parts = [torch.empty_like(padded) for _ in counts]
         dist.all_gather(parts, padded)
-        members = torch.cat([part[:size] for part, size in zip(parts, counts, strict=True)]).transpose(0, 1)
+        everyone = torch.cat([part[:size] for part, size in zip(parts, counts, strict=True)]).transpose(0, 1)
+        shape = (times, *ensemble.control.shape)
         if control is None:
-            control = torch.empty((times, *ensemble.control.shape), dtype=torch.float32)
-            covered = torch.empty(ensemble.control.shape[1:], dtype=torch.bool)
-        packed = torch.cat([control.flatten(), covered.to(control).flatten()])
+            control = [torch.empty(shape), torch.empty(shape[2:], dtype=torch.bool), 0.0]
+        field, covered, shock = control
+        packed = torch.cat([field.flatten(), covered.to(field).flatten()]).double()
+        packed = torch.cat([packed, torch.tensor([shock], dtype=torch.float64)])
         dist.broadcast(packed, 0)
-        control = packed[: control.numel()].reshape(control.shape)
-        return members, control, packed[control.numel() :].reshape(covered.shape) > 0.5
+        size = field.numel()
+        field = packed[:size].to(field).reshape(shape)
+        return everyone, field, packed[size:-1].reshape(shape[2:]) > 0.5, float(packed[-1])

@@ -14,7 +14,7 @@ from .schemes import GammaRamp, WeaklyCompressible
 from .units import Units
 
 # parameters that a scheme cannot do without; the others are switched off by None
-_NEEDED = ("sound_speed", "gamma", "smoothing_ratio", "courant")
+_NEEDED = ("sound_speed", "gamma", "smoothing_ratio", "courant", "valve_strength")
 
 
 @dataclass(frozen=True)
@@ -27,6 +27,9 @@ class Parameters:
         courant, background_pressure, artificial_viscosity, density_diffusion, shifting, bulk_damping: as in
             ``WeaklyCompressible``.
         xsph: epsilon of the scheme's XSPH. viscosity: dynamic, Pa s.
+        valve_strength: factor on what drives the flow through open valves: on the strength Q of pressure sources
+            (thesis 3.4), and on differences between the pressures that valves are given. The flux of other valves
+            follows from the walls' motion, which leaves nothing to be set.
     """
 
     sound_speed: float | Tensor | None
@@ -40,11 +43,13 @@ class Parameters:
     bulk_damping: float | Tensor | None = None
     xsph: float | Tensor | None = None
     viscosity: float | Tensor | None = None
+    valve_strength: float | Tensor = 1.0
 
     @classmethod
     def of(cls, scheme: WeaklyCompressible | Projection, fluid: Fluid) -> Parameters:
         """What a scheme and a fluid say."""
-        given = {f.name: getattr(scheme, f.name) for f in fields(cls) if f.name not in ("xsph", "viscosity")}
+        others = ("xsph", "viscosity", "valve_strength")
+        given = {f.name: getattr(scheme, f.name) for f in fields(cls) if f.name not in others}
         return cls(
             **given, xsph=None if scheme.xsph is None else scheme.xsph.epsilon,
             viscosity=fluid.viscosity if scheme.laminar_viscosity else None,

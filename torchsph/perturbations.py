@@ -6,7 +6,8 @@ import numpy as np
 import torch
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
-from torch.nn import functional
+
+from .ultrasound.fields import convolve_axis
 
 # the potential grows from the wall over this many correlation lengths
 _WALL_LAYER = 1.5
@@ -48,15 +49,11 @@ def flow_perturbations(
 
 
 def _smoothed(field: Tensor, deviations: list[float]) -> Tensor:
-    """Gaussian smoothing along the trailing axes; deviations in nodes, edges reflected."""
-    for axis, sigma in enumerate(deviations):
+    """Gaussian smoothing along the trailing axes; deviations in nodes, the edges' values going on beyond them."""
+    for axis, sigma in enumerate(deviations, -len(deviations)):
         reach = max(1, int(3.0 * sigma + 0.5))
         offset = torch.arange(-reach, reach + 1, dtype=field.dtype)
         weight = torch.exp(-0.5 * (offset / max(sigma, 1e-6)) ** 2)
-        weight = weight / weight.sum()
-        dim = axis - len(deviations)
-        moved = field.movedim(dim, -1)
-        flat = moved.reshape(-1, 1, moved.shape[-1])
-        padded = functional.pad(flat, (reach, reach), mode="replicate")
-        field = functional.conv1d(padded, weight[None, None]).reshape(moved.shape).movedim(-1, dim)
+        place = torch.arange(-reach, field.shape[axis] + reach).clamp(0, field.shape[axis] - 1)
+        field = convolve_axis(field.index_select(axis, place), weight / weight.sum(), axis, padded=False)
     return field

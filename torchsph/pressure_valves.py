@@ -73,13 +73,16 @@ class PressureValves:
         return self._reservoirs.valves[self._reservoirs.valve_of[number]]
 
     def _given(self, numbers: list[int], members: int) -> list[Tensor]:
-        """Pressure p / rho0 (members,) of openings, from their mean: a constant that all share moves nothing."""
+        """Pressure p / rho0 (members,) of openings, from their mean: a constant that all share moves nothing.
+
+        Times each member's valve strength.
+        """
         times = self.domain.member_times(members).tolist()
         rows = [[self._valve(n).pressure_at(t) for t in times] for n in numbers]
         if not rows:
             return []
         table = torch.tensor(rows, dtype=torch.float64, device=self.domain.device) / self._unit
-        return list(table - table.mean(0))
+        return list((table - table.mean(0)) * self.domain.valve_strength)
 
     def _followed(
         self, particles: Particles, row: Tensor, frame: Frame, stepper: Stepper | ProjectionStepper

@@ -104,7 +104,7 @@ class Simulation:
             self._sort(self._order)
         longest = self._longest_step(until)
         for stop in self.domain.breaks(self.time, until):
-            self.domain.enter(self.time, stop)
+            self.domain.enter(self.time, stop, valve_strength=self.parameters.valve_strength)
             self.particles = self.domain.prepare(self.particles)
             self._forget_pairs()
             self._advance_interval(stop, longest)
@@ -131,12 +131,14 @@ class Simulation:
         where the scheme has no place for it.
         """
         scheme = self.simulator.scheme
-        changeable = ("shifting", "courant", "viscosity")
+        changeable = ("shifting", "courant", "viscosity", "valve_strength")
         if isinstance(scheme, Projection) and not set(values) <= set(changeable):
             known = ", ".join(changeable)
             raise ValueError(f"of the incompressible scheme only {known} can change, got {list(values)}")
         if values.get("xsph") is not None and scheme.xsph is None:
             raise ValueError("parameter 'xsph' needs a scheme with XSPH, which says of what level and form it is")
+        if "valve_strength" in values and self.domain.sources is None and self._pressures is None:
+            raise ValueError("parameter 'valve_strength' needs pressure sources or valves that are given a pressure")
         complete = self.domain.walls is not None and isinstance(scheme.wall, CompleteKernelWall)
         if "smoothing_ratio" in values and complete:
             raise ValueError("the tables of a complete-kernel wall are made for the scheme's smoothing_ratio")
@@ -334,11 +336,12 @@ class Simulation:
         """Whether ``project`` knows what the scene's walls ask for."""
         return self.domain.walls is None or isinstance(self.simulator.scheme.wall, CompleteKernelWall)
 
-    def project(self, times: int = 1) -> None:
+    def project(self, times: int = 1) -> Tensor:
         """Make the fluid's velocities free of divergence, as the walls and the flux of open valves ask for.
 
         Costs ``times`` pressure solves; meant for velocities that were imposed, in scenes whose fluid fills its walls
-        or its periodic box.
+        or its periodic box. Returns (members,) what was taken from the velocities, RMS relative to the RMS of what is
+        left: the blow that the fluid would have got from its pressure in the first step.
         """
         if not self.can_project:
             raise ValueError("projecting velocities needs complete-kernel walls; potential walls have no kernel share")
@@ -346,7 +349,14 @@ class Simulation:
         wall = self.domain.sample(self.particles)
         search = self._stepper.pair_search
         here = Neighbourhood(self.particles, search, search.at(self.particles), self._stepper.support, wall)
-        self.particles = self.particles.changed(velocity=divergence_free(here, times=times)[0])
+        before = self.particles
+        self.particles = before.changed(velocity=divergence_free(here, times=times)[0])
+        mass = torch.where(before.fluid, before.mass, torch.zeros_like(before.mass)).double()
+        taken, left = (
+            before.per_member(mass * velocity.double().square().sum(1), "sum")
+            for velocity in (before.velocity - self.particles.velocity, self.particles.velocity)
+        )
+        return (taken / left.clamp_min(torch.finfo(left.dtype).tiny)).sqrt()
 
     def pull(self, grid: Grid, target: Tensor, gain: Tensor, weight: Tensor) -> None:
         """Pull the particles' velocities towards a measured grid.

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -12,6 +14,7 @@ from tqdm import tqdm
 import geometry
 import regularize
 
+from .parallel import shared
 from .wall_rows import wall_rows
 
 # noise and smoothness are chosen in every third frame and serve its neighbours: flow and noise change over tens of
@@ -75,26 +78,44 @@ class FrameSmoother:
         """
         return self._fit(frame, uncertainty=uncertainty, choice=self.choice(frame))
 
-    def fit_increment(
-        self, frame: int, points: Tensor, samples: Tensor, weight: Tensor, *, beam: Tensor | None = None,
+    def fit_increments(
+        self, frame: int, points: Tensor, samples: Tensor, weight: Tensor, *, choice: regularize.Choice | None = None,
+    ) -> list[regularize.SplineField]:
+        """Splines of increments (k, n, D) sampled at points (n, D) with confidences (n,); walls are at rest.
+
+        Noise, smoothness and outliers are chosen from the first of them, and the same linear estimate is made of the
+        others. ``choice``: noise and smoothness of an earlier increment; None chooses them as well.
+        """
+        return self._of_increments.fit_many(
+            points.double(), samples.double(), weight.double(), self._resting(frame),
+            divergence_points=self._inside(frame), choice=choice, judged=0,
+        )
+
+    def fit_along(
+        self, frame: int, points: Tensor, samples: Tensor, weight: Tensor, beam: Tensor,
         choice: regularize.Choice | None = None,
     ) -> regularize.SplineField:
-        """The spline of an increment from samples (n, D) at points (n, D) with confidences (n,); walls are at rest.
+        """The spline of one increment that is known along unit vectors ``beam`` (n, D) alone.
 
-        ``beam`` (n, D): directions along which alone the samples know it; noise and smoothness are then those of
-        ``choice``, or the smoother's own. ``choice``: taken over from an earlier increment; None chooses from this one.
+        Noise and smoothness are those of ``choice``, or the smoother's own.
         """
-        # a forecast's errors reach as far as those that samples share: the ones would be taken for the others
-        smoother = replace(self.smoother, correlated=False)
-        if beam is not None:
-            known = {} if choice is None else {"curvature": choice.curvature, "no_slip": choice.no_slip}
-            smoother, choice = smoother.fixed(**known), None
-        mask = torch.from_numpy(np.array(self.recording.mask[frame], bool).reshape(-1))
-        return smoother.fit(
-            points.double(), samples.double(), weight.double(),
-            wall_rows(self.recording, self.motion, frame, at_rest=True), divergence_points=self.nodes[mask],
-            beam=beam, choice=choice,
+        known = {} if choice is None else {"curvature": choice.curvature, "no_slip": choice.no_slip}
+        return self._of_increments.fixed(**known).fit(
+            points.double(), samples.double(), weight.double(), self._resting(frame),
+            divergence_points=self._inside(frame), beam=beam,
         )
+
+    @property
+    def _of_increments(self) -> regularize.Smoother:
+        # a forecast's errors reach as far as those that samples share: the ones would be taken for the others
+        return replace(self.smoother, correlated=False)
+
+    def _resting(self, frame: int) -> regularize.WallRows:
+        return wall_rows(self.recording, self.motion, frame, at_rest=True)
+
+    def _inside(self, frame: int) -> Tensor:
+        """(n, D) nodes in the mask of a frame."""
+        return self.nodes[torch.from_numpy(np.array(self.recording.mask[frame], bool).reshape(-1))]
 
     def _fit(
         self, frame: int, *, uncertainty: bool = False, choice: regularize.Choice | None = None
@@ -112,6 +133,27 @@ class FrameSmoother:
             self.nodes[used], samples[used], weight[used], wall_rows(recording, self.motion, frame),
             divergence_points=self.nodes[mask], beam=self._beam(frame, used), uncertainty=uncertainty, choice=choice,
         )
+
+    @property
+    def groups(self) -> int:
+        """Number of groups of frames that share a choice."""
+        return -(-self.recording.frames // self.choose_every)
+
+    def fitted(
+        self, group: int, done: Callable[[], object] = lambda: None
+    ) -> tuple[regularize.Choice | None, dict[int, np.ndarray]]:
+        """What was chosen for a group, and the fields (D, *shape) of its frames; ``done`` is called after each."""
+        first, fields = group * self.choose_every, {}
+        for frame in range(first, min(first + self.choose_every, self.recording.frames)):
+            if self.measures(frame):
+                fields[frame] = self.on_grid(self.fit(frame), frame)
+            done()
+        return self._choices.get(group), fields
+
+    def adopt(self, group: int, choice: regularize.Choice | None) -> None:
+        """Take over what another process chose for a group."""
+        if self.smoother.automatic:
+            self._choices[group] = choice
 
     def measures(self, frame: int) -> bool:
         """Whether a frame has anything to fit."""
@@ -173,14 +215,17 @@ def smooth(
 def smooth_frames(frames: FrameSmoother, progress: bool = False) -> geometry.Recording:
     """``smooth`` with a ``FrameSmoother`` of the caller's, who can then ask it what was chosen.
 
-    A frame in which nothing was measured has no spline: it holds 0 and counts as uncovered.
+    A frame in which nothing was measured has no spline: it holds 0 and counts as uncovered. Processes under torchrun
+    share the frames.
     """
     recording = frames.recording
     fields = np.zeros(recording.velocity.shape, np.float32)
-    missing = np.zeros(recording.frames, np.int64)
-    for frame in tqdm(range(recording.frames), desc="spline", disable=None if progress else True, unit="frame"):
-        if frames.measures(frame):
-            fields[frame] = frames.on_grid(frames.fit(frame), frame)
-        else:
-            missing[frame] = np.count_nonzero(recording.mask[frame])
+    missing = np.array([0 if frames.measures(f) else np.count_nonzero(recording.mask[f])
+                        for f in range(recording.frames)], np.int64)  # fmt: skip
+    with tqdm(total=recording.frames, desc="spline", disable=None if progress else True, unit="frame") as bar:
+        groups = [partial(frames.fitted, group, bar.update) for group in range(frames.groups)]
+        for group, (choice, fitted) in enumerate(shared(groups)):
+            frames.adopt(group, choice)
+            for frame, field in fitted.items():
+                fields[frame] = field
     return recording.with_velocity(fields, uncovered=missing, description="penalised B-spline, frame by frame")

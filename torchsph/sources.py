@@ -11,6 +11,7 @@ from torch import Tensor
 
 import geometry
 
+from .pairs.interface import per_particle
 from .particles import Particles
 from .record import Record
 from .scene import Scene
@@ -58,9 +59,17 @@ class Sources:
             return 0.0
         return (self.motion.volume_rate(late) - self.motion.volume_rate(early)) / (late - early)
 
-    def acceleration(self, particles: Particles, open_regions: tuple[int, ...], times: Tensor) -> Tensor | None:
-        """-grad V (3.4) of the open valves at the particles, (N, D), internal; None where none is open."""
-        self.push = None if not open_regions else self._acceleration(particles, open_regions, times)
+    def acceleration(
+        self, particles: Particles, open_regions: tuple[int, ...], times: Tensor, factor: float | Tensor = 1.0
+    ) -> Tensor | None:
+        """-grad V (3.4) of the open valves at the particles, (N, D), internal; None where none is open.
+
+        ``factor`` on Q, a number or (members,).
+        """
+        self.push = None
+        if open_regions:
+            push, each = self._acceleration(particles, open_regions, times), per_particle(factor, particles.member)
+            self.push = push * (each[:, None] if isinstance(each, Tensor) else each)
         return self.push
 
     def _acceleration(self, particles: Particles, open_regions: tuple[int, ...], times: Tensor) -> Tensor:

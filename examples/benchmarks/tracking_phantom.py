@@ -5,8 +5,8 @@
 
 TRUE.h5: a recording of the true flow, which neither tracker nor calibration has seen. Its echoes are simulated
 and tracked as `torchsph measure --mode speckle` does; the estimates are drawn in two planes through the long
-axis, at right angles, beside the truth; z-scores with the fitted sigma are listed by third of the weight. With
---loop the measurement goes through `torchsph assimilate`'s spline and ensemble.
+axis, at right angles, below the truth, and their errors below them; z-scores with the fitted sigma are listed by
+third of the weight. With --loop the measurement goes through `torchsph assimilate`'s spline and ensemble.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ import geometry
 from torchsph import metrics, pipeline, slices
 from torchsph.ultrasound import SpeckleOptions, measure_speckle
 
-COLUMNS = 6
+COLUMNS = 9
 
 
 def calibration(measured: geometry.Recording, true: geometry.Recording) -> dict:
@@ -66,21 +66,23 @@ def loop(measured: geometry.Recording, true: geometry.Recording, seed: int, memb
 
 
 def draw(path: Path, true: geometry.Recording, measured: geometry.Recording, quarter: bool) -> None:
-    """Speed and in-plane arrows of the truth and, below it, of the estimates, frame by frame."""
+    """Speed and in-plane arrows of the truth and, below it, of the estimates and of their errors, frame by frame."""
     plane = slices.valve_plane(true)
     if quarter:
         plane = replace(plane, across=np.cross(plane.along, plane.across))
     shown = replace(measured, mask=measured.mask & (measured.weight > 0))
+    rows = (("true", true, true.velocity), ("tracked", shown, shown.velocity),
+            ("error", shown, shown.velocity - true.velocity))  # fmt: skip
     columns = min(COLUMNS, len(measured.time))
     lines = -(-len(measured.time) // columns)
-    figure, axes = plt.subplots(2 * lines, columns, figsize=(2.2 * columns + 2, 6.4 * lines), squeeze=False)
+    figure, axes = plt.subplots(3 * lines, columns, figsize=(1.45 * columns + 1, 6.6 * lines), squeeze=False)
     top = float(np.percentile(np.linalg.norm(true.velocity, axis=1)[true.mask], 99.7))
     for axis in axes.flat:
         axis.set_axis_off()
     for frame, moment in enumerate(measured.time):
-        for row, recording in enumerate((true, shown)):
-            axis = axes[2 * (frame // columns) + row, frame % columns]
-            picture = slices.cut(recording, recording.velocity[frame], frame, plane, 0.5e-3)
+        for row, (name, recording, field) in enumerate(rows):
+            axis = axes[3 * (frame // columns) + row, frame % columns]
+            picture = slices.cut(recording, field[frame], frame, plane, 0.5e-3)
             image = axis.pcolormesh(1e3 * picture.across, 1e3 * picture.along, picture.speed, vmin=0, vmax=top)
             every = (slice(None, None, 3),) * 2
             axis.quiver(
@@ -90,16 +92,17 @@ def draw(path: Path, true: geometry.Recording, measured: geometry.Recording, qua
             for segment in picture.outline:
                 axis.plot(*(1e3 * segment.T), "k", lw=0.8)
             axis.set_aspect("equal")
-            axis.set_title(f"{'tracked' if row else 'true'}, {1e3 * moment:.0f} ms", fontsize=8)
-    figure.colorbar(image, ax=axes, label="speed (m/s)", shrink=0.4)
-    figure.savefig(path, dpi=80, bbox_inches="tight")
+            axis.set_title(f"{name}, {1e3 * moment:.0f} ms", fontsize=7)
+    figure.subplots_adjust(wspace=0.02, hspace=0.1)
+    figure.colorbar(image, ax=axes, label="speed (m/s)", shrink=0.4, pad=0.01)
+    figure.savefig(path, dpi=85, bbox_inches="tight")
     plt.close(figure)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("true", type=Path, metavar="TRUE.h5")
-    parser.add_argument("--every", type=int, default=5, metavar="K", help="each K-th frame (default: 5)")
+    parser.add_argument("--every", type=int, default=10, metavar="K", help="each K-th frame (default: 10)")
     parser.add_argument("--first", type=int, default=0, metavar="F", help="first frame (default: 0)")
     parser.add_argument("--last", type=int, metavar="F", help="last frame")
     parser.add_argument("--seed", type=int, default=0)
@@ -123,7 +126,7 @@ def main() -> None:
         measured = measure_speckle(true, options, arguments.seed, progress=True)
         if arguments.measured:
             geometry.write_recording(arguments.measured, measured)
-    results = {"description": measured.description, "frames": len(frames), "calibration": calibration(measured, true)}
+    results = {"description": measured.description, "frames": frames, "calibration": calibration(measured, true)}
     print(f"measured in {time.perf_counter() - began:.0f} s", json.dumps(results, indent=1), flush=True)
     if arguments.out:
         arguments.out.mkdir(parents=True, exist_ok=True)

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from .errors import AssimilationError
 from .filters import Analysis, Filter
-from .observations import Observations
+from .observations import Observations, Screened
 
 
 def member_slice(total: int, rank: int, processes: int) -> slice:
@@ -63,6 +63,12 @@ class Distributed:
             generator=generator,
         )
         return replace(analysis, ensemble=analysis.ensemble[start : start + counts[rank]])
+
+    def screen(self, ensemble: Tensor, predicted: Tensor, observations: Observations) -> Screened:
+        """See `Filter.screen`; the same in every process."""
+        counts = _counts(len(ensemble), ensemble.device, self.group)
+        everyone = (gather_members(part, counts, self.group) for part in (ensemble, predicted))
+        return self.filter.screen(*everyone, observations)
 
 
 def gather_members(members: Tensor, counts: list[int], group: dist.ProcessGroup | None = None) -> Tensor:

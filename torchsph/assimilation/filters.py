@@ -36,7 +36,8 @@ class Analysis:
             local analyses the mean over those that had observations.
         prior_factor: factor on the forecast's spread that was used, scalar or `(*batch,)`.
         spread_before, spread_after: `(*batch,)` root mean variance over the state.
-        transform: the linear map of members that was applied; a smoother applies it to earlier states.
+        transform: the linear map of members that was applied; a smoother applies it to earlier states. None where
+            it was left behind.
         rotation: `(*batch, N, N)` applied to the anomalies after it, or None.
         warnings: in words, empty when all is well.
     """
@@ -51,7 +52,7 @@ class Analysis:
     prior_factor: Tensor | float
     spread_before: Tensor
     spread_after: Tensor
-    transform: Transform
+    transform: Transform | None
     rotation: Tensor | None = None
     warnings: tuple[str, ...] = field(default=())
 
@@ -84,6 +85,9 @@ class Filter(Protocol):
             needed by localised filters only. A NaN row is a number without a place (a parameter).
         generator: needed by filters that draw random numbers.
         """
+
+    def screen(self, ensemble: Tensor, predicted: Tensor, observations: Observations) -> Screened:
+        """What `analyse` will use of the observations, for whoever works on the innovations at the same time."""
 
 
 class Transform(Protocol):
@@ -172,7 +176,7 @@ class EnsembleFilter(ABC):
         check_ensemble(ensemble, predicted, observations)
         wide = predicted.double()
         mean = self._mean(wide)
-        screened = screen(observations, mean, self._variance(wide), self.gross_error)
+        screened = self._screened(wide, observations)
         factor = torch.as_tensor(1.0, dtype=torch.float64)
         for part in self._inflations():
             factor = factor * part.prior_factor(screened)
@@ -199,6 +203,15 @@ class EnsembleFilter(ABC):
             rotation=rotation,
             warnings=_warnings(ensemble, before, reason),
         )
+
+    def screen(self, ensemble: Tensor, predicted: Tensor, observations: Observations) -> Screened:
+        """See `Filter.screen`."""
+        check_ensemble(ensemble, predicted, observations)
+        return self._screened(predicted.double(), observations)
+
+    def _screened(self, predicted: Tensor, observations: Observations) -> Screened:
+        mean, variance = self._mean(predicted), self._variance(predicted)
+        return screen(observations, mean, variance, self.gross_error)
 
     def _mean(self, points: Tensor) -> Tensor:
         """`(*batch, k)` estimate from members `(*batch, N, k)`; equal weights unless a method says

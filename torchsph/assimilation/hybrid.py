@@ -10,7 +10,7 @@ from torch import Tensor
 
 from .errors import AssimilationError
 from .filters import Analysis, Filter
-from .observations import Observations, Reason
+from .observations import Observations, Reason, Screened
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,3 +68,7 @@ class HybridGain:
             ensemble=(analysis.ensemble.double() + shift.unsqueeze(-2)).to(ensemble.dtype),
             mean=(analysis.mean.double() + shift).to(ensemble.dtype),
         )
+
+    def screen(self, ensemble: Tensor, predicted: Tensor, observations: Observations) -> Screened:
+        """See `Filter.screen`."""
+        return self.filter.screen(ensemble, predicted, observations)

@@ -46,13 +46,22 @@ class ReducedUnscented(EnsembleFilter):
         generator: torch.Generator | None = None,
     ) -> Analysis:
         """See `Filter.analyse`; `ensemble` and `predicted` are sigma points in the order of the rule."""
-        check_ensemble(ensemble, predicted, observations)
-        if self.keep_variance:
-            factor = self._lost_variance(ensemble)
-            ensemble, predicted = self._stretch(ensemble, factor), self._stretch(predicted, factor)
         return super().analyse(
-            ensemble, predicted, observations, state_positions=state_positions, generator=generator
-        )
+            *self._kept(ensemble, predicted, observations), observations, state_positions=state_positions,
+            generator=generator,
+        )  # fmt: skip
+
+    def screen(self, ensemble: Tensor, predicted: Tensor, observations: Observations) -> Screened:
+        """See `Filter.screen`."""
+        return super().screen(*self._kept(ensemble, predicted, observations), observations)
+
+    def _kept(self, ensemble: Tensor, predicted: Tensor, observations: Observations) -> tuple[Tensor, Tensor]:
+        """States and predictions with the variance that the projection on sigma points takes from them."""
+        check_ensemble(ensemble, predicted, observations)
+        if not self.keep_variance:
+            return ensemble, predicted
+        factor = self._lost_variance(ensemble)
+        return self._stretch(ensemble, factor), self._stretch(predicted, factor)
 
     def _rule(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Weights `(N,)`, coordinates `(N, r)` and the projection `(r, N)` of points on their modes."""

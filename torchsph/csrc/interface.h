@@ -116,6 +116,47 @@ typedef struct { /* complete-kernel walls' part of the sums; see walls.cpp */
   void* near_distance;                   /* (count,) likewise */
 } sph_walls;
 
+typedef struct { /* normalised correlation of kernels with what surrounds them; see correlation.cpp */
+  int32_t threads;
+  int64_t points, images, apart;
+  int64_t shape[3], half[3], search[3]; /* along z, y, x, in nodes */
+  const void* volume;                   /* (z, y, x, images) complex; every kernel and lag lies inside */
+  const int64_t *corner, *offset;       /* (points, 3) first nodes of the kernels, and the lags amid those searched */
+  const void* ramp;                     /* (points, 3) rad per node and image, or null */
+  void* rho;                            /* (points, lags z, y, x) complex */
+} sph_correlation;
+
+typedef struct { /* a packet's images put side by side at each node; see images.cpp */
+  int32_t threads;
+  int64_t images;
+  int64_t shape[3], margin[3]; /* along z, y, x: nodes of an image, and of the rim of the arrays below */
+  const void* samples;         /* (images, z, y, x) complex */
+  void* volume;                /* (.., images) complex, or null; their rims are filled with 0 */
+  void* power;                 /* (..) mean square */
+  void* turn;                  /* (..) complex sum of conj(sample) times that of the next image, over the
+                                  root of the power, or null */
+} sph_images;
+
+typedef struct { /* sums of a field over boxes around points; see images.cpp */
+  int32_t threads;
+  int64_t points, parts;      /* parts: 1 for a real field, 2 for a complex one */
+  int64_t shape[3], reach[3]; /* along z, y, x: of the field, and of a box to either side, in nodes */
+  const void* field;
+  const int64_t* middle;      /* (points, 3) nodes */
+  void* out;                  /* (points,), of the field's type */
+} sph_boxes;
+
+typedef struct { /* points and a periodic lattice; see gridding.cpp */
+  int32_t threads, dimension, width;
+  double shape_parameter;
+  double origin[3], spacing[3]; /* along x, y, z */
+  int64_t counts[3];            /* nodes, at least `width` */
+  int64_t points;
+  const void* position;         /* (points, dimension) */
+  void* values;                 /* (points,) complex */
+  void* field;                  /* (.., y, x) complex; spread: added to */
+} sph_gridding;
+
 #ifdef __cplusplus
 extern "C" {
 #endif
@@ -138,6 +179,16 @@ void sph_wall_forces_f32(const sph_walls*);
 void sph_wall_forces_f64(const sph_walls*);
 int64_t sph_wall_near_f32(const sph_walls*);
 int64_t sph_wall_near_f64(const sph_walls*);
+void sph_correlate_f32(const sph_correlation*);
+void sph_correlate_f64(const sph_correlation*);
+void sph_arrange_f32(const sph_images*);
+void sph_arrange_f64(const sph_images*);
+void sph_box_sums_f32(const sph_boxes*);
+void sph_box_sums_f64(const sph_boxes*);
+void sph_spread_f32(const sph_gridding*);
+void sph_spread_f64(const sph_gridding*);
+void sph_gather_f32(const sph_gridding*);
+void sph_gather_f64(const sph_gridding*);
 void sph_grid_closest(const sph_closest*);
 int sph_runs(const char* instruction_set);             /* whether this processor has it */
 double sph_fma(int threads, int64_t turns, float factor); /* float32 multiply-adds; the flop done */

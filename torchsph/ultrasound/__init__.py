@@ -17,7 +17,7 @@ from .plugin import LibraryTracker, Tracker
 from .pointspread import GaussianPointSpread, PointSpread, SampledPointSpread, SectorPointSpread
 from .speckle_measurement import SpeckleOptions, measure_speckle
 from .tracking import SpeckleTracker, track
-from .training import SwirlFlow, TrainingPlan, calibrate, random_swirl
+from .training import SwirlFlow, TrainingPlan, calibrate, random_scene, random_swirl
 from .uff import UffVolumes, read_uff, write_uff
 
 __all__ = [
@@ -56,6 +56,7 @@ __all__ = [
     "measure_doppler",
     "measure_noise",
     "measure_speckle",
+    "random_scene",
     "random_swirl",
     "read_uff",
     "simulate_packet",

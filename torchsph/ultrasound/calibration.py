@@ -63,8 +63,8 @@ class Calibration:
 
 
 def features(estimates: Estimates, beam: Tensor, axial: bool) -> Tensor:
-    """What the log variance is linear in, (n, 8): 1, predicted log variance, log(1 - rho), log peak ratio, log shear,
-    and in 10 dB the SNR, the share of power passed by the clutter filter and its response to the velocity.
+    """What the log variance is linear in, (n, 9): 1, predicted log variance, log(1 - rho), log peak ratio, log shear,
+    log bend, and in 10 dB the SNR, the share of power passed by the clutter filter and its response to the velocity.
 
     All bounded, so that an odd estimate cannot ask for an absurd deviation. What a tracker does not tell (NaN) counts
     as the least that is known: a variance of 1 m^2/s^2, a peak ratio of 1, an SNR of 20 dB.
@@ -78,8 +78,9 @@ def features(estimates: Estimates, beam: Tensor, axial: bool) -> Tensor:
     power = torch.nan_to_num(estimates.power, nan=0.0).clamp(-60, 5) / 10
     response = torch.nan_to_num(estimates.response, nan=0.0).clamp(-20, 0) / 10
     shear = torch.nan_to_num(estimates.shear, nan=10.0).clamp(10.0, 300.0).log()
+    bend = torch.nan_to_num(estimates.bend, nan=0.1).clamp(1e-3, 0.1).log()
     one = torch.ones_like(predicted)
-    return torch.stack([one, predicted, decorrelation, ratio, shear, snr, power, response], 1)
+    return torch.stack([one, predicted, decorrelation, ratio, shear, bend, snr, power, response], 1)
 
 
 def fit_calibration(estimates: Estimates, error: Tensor, beam: Tensor) -> Calibration:

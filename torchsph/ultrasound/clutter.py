@@ -15,6 +15,8 @@ import torch
 from scipy.signal import firwin
 from torch import Tensor
 
+IMAGES_AT_ONCE = 16  # that an FIR filter makes: more of them would multiply mostly by zeros
+
 
 class ClutterFilter(Protocol):
     """A filter over the images of a packet."""
@@ -64,12 +66,17 @@ class FIRFilter:
             raise ValueError(
                 f"an FIR filter of {self.taps} taps needs as many images, the packet has {len(iq)}"
             )
-        design = self.coefficients()
-        valid = len(iq) - self.taps + 1
-        filtered = design[-1] * iq[:valid]
-        for lag in range(1, self.taps):  # symmetric, so convolution and correlation agree
-            filtered.add_(iq[lag : lag + valid], alpha=float(design[-1 - lag]))
-        return filtered
+        valid, parts = len(iq) - self.taps + 1, torch.view_as_real(iq.resolve_conj()).reshape(len(iq), -1)
+        rows = min(valid, IMAGES_AT_ONCE)
+        band, design = parts.new_zeros((rows, rows + self.taps - 1)), parts.new_tensor(self.coefficients())
+        for row in range(rows):
+            band[row, row : row + self.taps] = design  # symmetric, so convolution and correlation agree
+        filtered = parts.new_empty((valid, parts.shape[1]))
+        for first in range(0, valid, rows):  # products with a band matrix: one pass over memory, not one per tap
+            last = min(first + rows, valid)
+            some = band[: last - first, : last - first + self.taps - 1]
+            torch.mm(some, parts[first : last + self.taps - 1], out=filtered[first:last])
+        return torch.view_as_complex(filtered.view(valid, *iq.shape[1:], 2))
 
     def response(self, frequency: np.ndarray) -> np.ndarray:
         """Power response at ``frequency`` in units of the PRF."""

@@ -1,19 +1,23 @@
-"""Normalised cross-correlation of small kernels between images of a packet, for many points at once.
+"""Normalised cross-correlation of small kernels between images of a packet, for many points at once, by torch.
 
 The sums over images and over two axes of the kernel are matrix products: one of kernel rows by region rows
 for every node along the slowest axis and every lag along the fastest, so that the search runs at the speed of
 a batched matrix multiplication. Lags of the slowest axis are further columns of a product, those of the
-middle axis its diagonals. What the products are normalised by comes from running sums over the whole image.
+middle axis its diagonals. This is what the compiled sums of ``csrc/correlation.cpp`` are held against.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
-from .fields import box_sum
+from .fields import power
+
+REGION_BYTES = 8 << 20  # of what is searched, gathered at a time: it bounds memory and stays in a CPU's cache
 
 
 @dataclass(frozen=True)
@@ -36,39 +40,10 @@ class KernelShape:
         return tuple(2 * (h + s) + 1 for h, s in zip(self.half, self.search, strict=True))
 
 
-def power(samples: Tensor) -> Tensor:
-    """|samples|^2 of complex samples, without the square root that ``abs`` takes (several times faster)."""
-    parts = torch.view_as_real(samples)
-    return torch.addcmul(parts[..., 0].square(), parts[..., 1], parts[..., 1])
-
-
-@dataclass(frozen=True, eq=False)
-class ImagePairs:
-    """A packet ``volume`` (Z, Y, X, T) whose images are compared ``apart`` images from each other.
-
-    first, second (Z, Y, X): sum of |sample|^2 over the kernel around each node and over the first and the
-    second images of the pairs. The volume must be contiguous, with ``search`` and ``half`` nodes to spare
-    around every kernel and lag, and T > apart.
-    """
-
-    volume: Tensor
-    apart: int
-    first: Tensor
-    second: Tensor
-
-
-def image_pairs(volume: Tensor, apart: int, half: tuple[int, int, int]) -> ImagePairs:
-    """Pairs of images ``apart`` images from each other, for kernels of ``half`` widths in nodes."""
-    if not 0 < apart < volume.shape[-1]:
-        raise ValueError(f"images {apart} apart cannot be compared in a packet of {volume.shape[-1]}")
-    parts = torch.view_as_real(volume)
-    energies = []
-    for images in (parts[..., :-apart, :], parts[..., apart:, :]):
-        energy = torch.linalg.vector_norm(images, dim=(-2, -1)).square()
-        for axis, h in enumerate(half):
-            energy = box_sum(energy, 2 * h + 1, axis)
-        energies.append(energy)
-    return ImagePairs(volume, apart, *energies)
+def check_apart(apart: int, images: int) -> None:
+    """ValueError where a packet of ``images`` holds no two that are ``apart`` images apart."""
+    if not 0 < apart < images:
+        raise ValueError(f"images {apart} apart cannot be compared in a packet of {images}")
 
 
 def gather(volume: Tensor, corner: Tensor, size: tuple[int, int, int], *, early: int = 0) -> Tensor:
@@ -92,10 +67,11 @@ def gather(volume: Tensor, corner: Tensor, size: tuple[int, int, int], *, early:
 
 
 def correlate(
-    pairs: ImagePairs, corner: Tensor, offset: Tensor, shape: KernelShape, *, ramp: Tensor | None = None
+    volume: Tensor, apart: int, corner: Tensor, offset: Tensor, shape: KernelShape, *, ramp: Tensor | None = None
 ) -> Tensor:
-    """Normalised complex correlation (P, Lz, Ly, Lx), pooled over all pairs of images.
+    """Normalised complex correlation (P, Lz, Ly, Lx), pooled over all pairs of images ``apart`` images apart.
 
+    ``volume`` (Z, Y, X, T), contiguous, with a node to spare around every kernel and lag, T > apart;
     ``corner`` (P, 3): first node of each kernel; ``offset`` (P, 3): lag in the middle of the search, nodes.
     With a(t, k) the kernel and b(t + apart, k + s) what lies at lag s,
 
@@ -106,18 +82,32 @@ def correlate(
     kernel's nodes are turned back to its middle by it, so that axial shear does not make their products
     cancel.
     """
-    images = pairs.volume.shape[-1]
+    check_apart(apart, volume.shape[-1])
+    each = math.prod(shape.region) * volume.shape[-1] * volume.element_size()
+    starts = range(0, max(len(corner), 1), max(REGION_BYTES // each, 1))
+    parts = [slice(start, start + starts.step) for start in starts]
+    ramps = [None if ramp is None else ramp[part] for part in parts]
+    return torch.cat([
+        _correlate(volume, apart, corner[part], offset[part], shape, turn)
+        for part, turn in zip(parts, ramps, strict=True)
+    ])  # fmt: skip
+
+
+def _correlate(
+    volume: Tensor, apart: int, corner: Tensor, offset: Tensor, shape: KernelShape, ramp: Tensor | None
+) -> Tensor:
+    images = volume.shape[-1]
     # read early by as many images as the pairs are apart, the kernel lies opposite to what it is compared with
-    kernel = gather(pairs.volume, corner, shape.size, early=pairs.apart)
+    kernel = gather(volume, corner, shape.size, early=apart)
     kernel = kernel.view(*kernel.shape[:3], shape.size[2], images)
-    kernel[..., : pairs.apart] = 0
-    kernel = kernel.conj() * _ramp_phasors(-ramp * pairs.apart, shape) if ramp is not None else kernel.conj()
-    start = corner + offset - corner.new_tensor(shape.search)
-    product = _lag_products(kernel.flatten(3), gather(pairs.volume, start, shape.region), shape, images)
-    middle = corner.new_tensor(shape.half)
-    first = gather(pairs.first[..., None], corner + middle, (1, 1, 1))
-    second = gather(pairs.second[..., None], start + middle, shape.lags)
-    norm = (first * second).sqrt()
+    kernel[..., :apart] = 0
+    kernel = kernel.conj() * _ramp_phasors(-ramp * apart, shape) if ramp is not None else kernel.conj()
+    region = gather(volume, corner + offset - corner.new_tensor(shape.search), shape.region)
+    product = _lag_products(kernel.flatten(3), region, shape, images)
+    first = power(kernel).flatten(1).sum(1)
+    around = power(region.view(*region.shape[:3], shape.region[2], images)[..., apart:]).sum(-1)
+    second = F.avg_pool3d(around[:, None], shape.size, stride=1, divisor_override=1)[:, 0]
+    norm = first.sqrt()[:, None, None, None] * second.sqrt()
     tiny = torch.finfo(norm.dtype).tiny ** 0.5
     return torch.where(norm > tiny, product / norm.clamp_min(tiny), 0)
 

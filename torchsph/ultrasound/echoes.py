@@ -71,20 +71,19 @@ def simulate_packet(
     # density * energy is the speckle power of unit amplitudes, so this makes the blood's power 1 everywhere
     scale = 1 / (density * energy).sqrt()
     noise = 0.0 if model.snr is None else 10 ** (-model.snr / 10)
-    images = []
+    images = torch.empty((acquisition.packet, *grid.shape), dtype=dtype.to_complex(), device=generator.device)
     for number in range(acquisition.packet):
         now = start + number * acquisition.interval
-        iq = imager.image(cloud.position, _echogenicity(cloud, model)) * scale
+        position, amplitude = cloud.position, _echogenicity(cloud, model)
         if haze is not None:
             shift = haze.position.new_tensor(model.clutter_velocity or (0.0,) * grid.dimension) * (now - time)
-            iq += imager.image(haze.position + shift, haze.amplitude * 10 ** (model.clutter / 20)) * scale
-        if noise:
-            iq += math.sqrt(noise) * imager.noise(generator)
-        images.append(iq)
+            position = torch.cat([position, haze.position + shift])
+            amplitude = torch.cat([amplitude, haze.amplitude * 10 ** (model.clutter / 20)])
+        images[number] = imager.noisy_image(position, amplitude, scale, noise, generator)
         if number + 1 < acquisition.packet:
             cloud = carry(cloud, box, flow, now, acquisition.interval, density, generator)
             cloud = reseed(cloud, box, flow, now + acquisition.interval, density, generator)
-    return Packet(torch.stack(images), grid, acquisition, model.beams, noise)
+    return Packet(images, grid, acquisition, model.beams, noise)
 
 
 def make_imager(

@@ -39,7 +39,8 @@ class Estimates:
     ``sigma`` of it. power (n,): share of the unfiltered power that passed the clutter filter, dB. snr
     (n,): power over thermal noise after the filter, dB (NaN if the noise is unknown). response (n,): of the
     clutter filter at the Doppler frequency of the velocity, dB. shear (n,): size of the axial velocity's
-    gradient, 1/s (NaN if it was not looked for). lag (n,): images between those compared. flags (n,):
+    gradient, 1/s, and bend (n,): how far half a kernel further on it is off a straight line, m/s (both NaN if not
+    looked for). lag (n,): images between those compared. flags (n,):
     :class:`Flag` bits, 0 = accepted.
     """
 
@@ -52,6 +53,7 @@ class Estimates:
     snr: Tensor
     response: Tensor
     shear: Tensor
+    bend: Tensor
     lag: Tensor
     flags: Tensor
 

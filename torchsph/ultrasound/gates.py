@@ -8,32 +8,26 @@ import torch
 from torch import Tensor
 
 from .acquisition import decibel
-from .correlation import gather
 from .estimates import Flag, bit
 from .prepared import Prepared
 
 
 def gates(
-    images: Prepared, corner: Tensor, *, min_samples: int, min_blood: float | None, min_snr: float | None,
+    images: Prepared, nodes: Tensor, *, min_samples: int, min_blood: float | None, min_snr: float | None,
     max_snr: float | None,
 ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
     """Power over noise (dB), share of power passed (dB) and the flags that need no correlation, each (P,).
 
-    ``corner`` (P, 3): first nodes of the kernels. See :class:`SpeckleTracker` for the thresholds.
+    ``nodes`` (P, 3): in the middle of the kernels. See :class:`SpeckleTracker` for the thresholds.
     """
-
-    def kernel(field: Tensor) -> Tensor:
-        return gather(field[..., None], corner, images.shape.size)
-
-    inside, finite = kernel(images.inside), kernel(images.finite)
-    count = inside.sum((1, 2, 3)).clamp_min(1)
-    passed = kernel(images.power).sum((1, 2, 3)) / count
-    before = kernel(images.raw_power).sum((1, 2, 3)) / count
+    covered = images.covered(nodes)
+    count = covered.prod(1).clamp_min(1)
+    passed = images.kernel_sums(images.power, nodes) / count
+    before = images.kernel_sums(images.raw_power, nodes) / count
     share = decibel(passed / before.clamp_min(torch.finfo(before.dtype).tiny))
-    flags = bit((finite < inside).flatten(1).any(1), Flag.NOT_FINITE)
-    for axis in images.active:
-        others = [a + 1 for a in range(3) if a != axis]
-        flags |= bit(inside.amax(others).sum(1) < min_samples, Flag.SAMPLES)
+    flags = bit((covered[:, list(images.active)] < min_samples).any(1), Flag.SAMPLES)
+    if images.spoilt is not None:
+        flags |= bit(images.kernel_sums(images.spoilt, nodes) > 0, Flag.NOT_FINITE)
     weak = passed <= 0
     if min_blood is not None:
         weak |= share < min_blood

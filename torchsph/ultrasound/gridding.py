@@ -8,6 +8,7 @@ about 1e-3 at four nodes and an oversampling of 1.5, falling some tenfold per no
 
 from __future__ import annotations
 
+import ctypes
 import math
 from dataclasses import dataclass
 from itertools import product
@@ -16,7 +17,26 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..pairs.native import LibraryMissing, library
+
 CHUNK = 1 << 14  # points spread at a time: their stencils stay in the cache
+
+
+_REALS = {torch.complex64: (torch.float32, "f32"), torch.complex128: (torch.float64, "f64")}
+_pointer, _int, _long, _real = ctypes.c_void_p, ctypes.c_int32, ctypes.c_int64, ctypes.c_double
+
+
+class _Arguments(ctypes.Structure):
+    """sph_gridding of csrc/interface.h."""
+
+    _fields_ = [
+        *((name, _int) for name in ("threads", "dimension", "width")),
+        ("shape_parameter", _real),
+        *((name, _real * 3) for name in ("origin", "spacing")),
+        ("counts", _long * 3),
+        ("points", _long),
+        *((name, _pointer) for name in ("position", "values", "field")),
+    ]
 
 
 @dataclass(frozen=True)
@@ -48,8 +68,16 @@ class Gridding:
         return 0.97 * math.pi * self.width * (1 - 0.5 / self.oversampling)
 
     def spread(self, points: Tensor, values: Tensor) -> Tensor:
-        """Add ``values`` (n,), real or complex, at ``points`` (n, D) to a lattice of zeros: (*shape)."""
+        """Add ``values`` (n,), real or complex, at ``points`` (n, D) to a lattice of zeros: (*shape).
+
+        Complex ones by compiled code where there is some (0.4 million points in 3-D, one core: 30 ms), else by
+        torch (175 ms).
+        """
         field = values.new_zeros(math.prod(self.shape))
+        compiled = _compiled("spread", points, values)
+        if compiled is not None:
+            self._call(compiled, points, values.resolve_conj().contiguous(), field)
+            return field.view(self.shape)
         for start in range(0, len(points), CHUNK):
             nodes, weights = self._stencil(points[start : start + CHUNK])
             field.index_add_(
@@ -59,12 +87,26 @@ class Gridding:
 
     def gather(self, field: Tensor, points: Tensor) -> Tensor:
         """Adjoint of :meth:`spread`: weighted sums (n,) of ``field`` (*shape) around ``points`` (n, D)."""
+        compiled = _compiled("gather", points, field)
+        if compiled is not None:
+            values = field.new_empty(len(points))
+            self._call(compiled, points, values, field.resolve_conj().contiguous())
+            return values
         flat = field.reshape(-1)
         parts = []
         for start in range(0, len(points), CHUNK):
             nodes, weights = self._stencil(points[start : start + CHUNK])
             parts.append((flat[nodes] * weights).sum(1))
         return torch.cat(parts) if parts else flat.new_zeros(0)
+
+    def _call(self, function: ctypes._CFuncPtr, points: Tensor, values: Tensor, field: Tensor) -> None:
+        points, triple, dimension = points.contiguous(), _real * 3, len(self.shape)
+        function(ctypes.byref(_Arguments(
+            threads=torch.get_num_threads(), dimension=dimension, width=self.width,
+            shape_parameter=self.shape_parameter, origin=triple(*self.origin), spacing=triple(*self.spacing),
+            counts=(_long * 3)(*reversed(self.shape)), points=len(points), position=points.data_ptr(),
+            values=values.data_ptr(), field=field.data_ptr(),
+        )))  # fmt: skip
 
     def wavenumbers(self, axis: int, like: Tensor) -> Tensor:
         """Angular wavenumbers (nodes,), rad/m, of the lattice's Fourier transform; axis 0 is x."""
@@ -99,6 +141,20 @@ class Gridding:
         """The kernel at ``distance`` in half widths; zero beyond 1."""
         root = (1 - distance.square()).clamp_min(0).sqrt()
         return torch.where(distance.abs() <= 1, torch.exp(self.shape_parameter * (root - 1)), 0)
+
+
+def _compiled(name: str, points: Tensor, samples: Tensor) -> ctypes._CFuncPtr | None:
+    """Compiled sums for complex samples on the CPU; None where torch has to do."""
+    real, suffix = _REALS.get(samples.dtype, (None, ""))
+    derived = torch.is_grad_enabled() and (points.requires_grad or samples.requires_grad)
+    if samples.device.type != "cpu" or points.dtype != real or derived:
+        return None
+    try:
+        function = library().function(name, suffix)
+    except LibraryMissing:
+        return None
+    function.restype = None
+    return function
 
 
 def fast_length(least: int) -> int:

@@ -20,6 +20,8 @@ from .convolution import Convolution
 from .gridding import fast_length
 from .pointspread import PointSpread
 
+PLANE_BYTES = 4 << 20  # of a transform's temporary arrays
+
 
 class Imager(Protocol):
     """Forms images on a grid.
@@ -34,8 +36,11 @@ class Imager(Protocol):
         """IQ (*shape) of scatterers at ``points`` (n, D), m, with complex ``amplitude`` (n,)."""
         ...
 
-    def noise(self, generator: torch.Generator) -> Tensor:
-        """Circular Gaussian noise (*shape) of power 1 in the band of the point-spread function."""
+    def noisy_image(
+        self, points: Tensor, amplitude: Tensor, gain: Tensor, noise: float, generator: torch.Generator
+    ) -> Tensor:
+        """:meth:`image` times ``gain`` (in the shape of ``energy``), in circular Gaussian noise of power
+        ``noise`` in the band of the point-spread function."""
         ...
 
 
@@ -72,36 +77,61 @@ class ParallelImager:
 
         A lone scatterer of amplitude 1 gives h(x - point) exp(-i 4 pi f depth / c).
         """
+        return self._render(self._series(points, amplitude))
+
+    def noisy_image(
+        self, points: Tensor, amplitude: Tensor, gain: Tensor, noise: float, generator: torch.Generator
+    ) -> Tensor:
+        """See :class:`Imager`; echoes and noise are one series, transformed once."""
+        series = self._series(points, amplitude * gain)
+        if noise:
+            series += math.sqrt(noise) * self._convolution.noise(generator)
+        return self._render(series)
+
+    def noise(self, generator: torch.Generator) -> Tensor:
+        """Noise (*shape) of power 1, see :meth:`Convolution.noise`."""
+        return self._render(self._convolution.noise(generator))
+
+    def _series(self, points: Tensor, amplitude: Tensor) -> Tensor:
+        """Fourier series (*lattice) of the scatterers' image."""
         near = ((points >= self._lower - self._reach) & (points <= self._upper + self._reach)).all(1)
         points, amplitude = points[near], amplitude[near]
         # depth from the grid's corner keeps the phase small, and so exact in float32; then one common factor
         phase = -self.acquisition.phase_per_metre * self.beams.depth(points - self._lower)
         series = self._convolution.series(points, amplitude * torch.polar(torch.ones_like(phase), phase))
         corner = sum(o * b for o, b in zip(self.grid.origin, self.beams.direction, strict=True))
-        return self._render(series) * cmath.exp(-1j * self.acquisition.phase_per_metre * corner)
-
-    def noise(self, generator: torch.Generator) -> Tensor:
-        """Noise (*shape) of power 1, see :meth:`Convolution.noise`."""
-        return self._render(self._convolution.noise(generator))
+        return series.mul_(cmath.exp(-1j * self.acquisition.phase_per_metre * corner))
 
     def _render(self, series: Tensor) -> Tensor:
-        """Evaluate a Fourier series (*lattice) on the grid's nodes."""
-        image = torch.fft.ifftn(resize_spectrum(series, self._padded), norm="forward")
-        for axis, (pad, nodes) in enumerate(zip(self._pad, self.grid.shape, strict=True)):
-            image = image.narrow(axis, pad, nodes)
-        return image.contiguous()
+        """Evaluate a Fourier series (*lattice) on the grid's nodes.
+
+        Axis by axis, and only for the rows that are kept of the axes before: half the work of a transform of
+        the whole padded box. The later axes a few planes at a time, which stay in the cache.
+        """
+        rows, image = self._along(series, 0), series.new_empty(self.grid.shape)
+        planes = max(1, PLANE_BYTES // (math.prod(self._padded[1:]) * series.element_size()))
+        for start in range(0, len(rows), planes):
+            part = rows[start : start + planes]
+            for axis in range(1, part.dim()):
+                part = self._along(part, axis)
+            image[start : start + planes] = part
+        return image
+
+    def _along(self, series: Tensor, axis: int) -> Tensor:
+        """Evaluate a Fourier series along one axis, at the grid's nodes."""
+        nodes = torch.fft.ifft(resize_spectrum(series, axis, self._padded[axis]), dim=axis, norm="forward")
+        return nodes.narrow(axis, self._pad[axis], self.grid.shape[axis])
 
 
-def resize_spectrum(spectrum: Tensor, shape: tuple[int, ...]) -> Tensor:
-    """Zero-pad or crop a Fourier series (in FFT order) to ``shape``: the same function on other nodes."""
-    for axis, nodes in enumerate(shape):
-        have = spectrum.shape[axis]
-        keep = min(have, nodes)
-        positive, negative = (keep + 1) // 2, (keep - 1) // 2  # an unpaired Nyquist term is dropped
-        parts = [spectrum.narrow(axis, 0, positive)]
-        gap = list(spectrum.shape)
-        gap[axis] = nodes - positive - negative
-        parts.append(spectrum.new_zeros(gap))
-        parts.append(spectrum.narrow(axis, have - negative, negative))
-        spectrum = torch.cat(parts, axis)
-    return spectrum
+def resize_spectrum(spectrum: Tensor, axis: int, nodes: int) -> Tensor:
+    """Zero-pad or crop a Fourier series (in FFT order) to ``nodes`` terms along an axis: the same function on
+    other nodes."""
+    have = spectrum.shape[axis]
+    keep = min(have, nodes)
+    positive, negative = (keep + 1) // 2, (keep - 1) // 2  # an unpaired Nyquist term is dropped
+    gap = list(spectrum.shape)
+    gap[axis] = nodes - positive - negative
+    return torch.cat([
+        spectrum.narrow(axis, 0, positive), spectrum.new_zeros(gap),
+        spectrum.narrow(axis, have - negative, negative),
+    ], axis)  # fmt: skip

@@ -8,7 +8,7 @@ from dataclasses import dataclass, fields
 import torch
 from torch import Tensor
 
-from .correlation import ImagePairs, KernelShape, correlate
+from .correlation import KernelShape
 from .peak import Peak, find_peak
 from .prepared import Prepared
 
@@ -44,16 +44,17 @@ class Motion:
 
 
 def find_motion(
-    images: Prepared, pairs: ImagePairs, corner: Tensor, offset: Tensor, shape: KernelShape, beam: Tensor,
-    *, prior: Motion | None, phase: bool,
+    images: Prepared, lag: int, corner: Tensor, offset: Tensor, shape: KernelShape, beam: Tensor,
+    *, ramp: Tensor | None, prior: Motion | None, phase: bool,
 ) -> Motion:  # fmt: skip
-    """Motion of kernels with first nodes ``corner`` (P, 3), searched around ``offset`` (P, 3), nodes.
+    """Motion between images ``lag`` images apart of kernels with first nodes ``corner`` (P, 3), searched
+    around ``offset`` (P, 3), nodes.
 
     With ``phase`` the axial component is that of the correlation's phase, the whole turns of which are told
-    by ``prior`` or else by the peak itself. ``beam`` (P, 3): unit vectors.
+    by ``prior`` or else by the peak itself. ``beam`` (P, 3): unit vectors. ``ramp``: see :func:`correlate`.
     """
-    rho = correlate(pairs, corner, offset, shape, ramp=images.ramp(corner))
-    active, lag = list(images.active), pairs.apart
+    rho = images.backend.correlate(images.volume, lag, corner, offset, shape, ramp=ramp)
+    active = list(images.active)
     peak = find_peak(rho.squeeze(1) if 0 not in active else rho)
     spacing, along = images.spacing[active], beam[:, active]
     start = offset[:, active] * spacing

@@ -51,7 +51,8 @@ def find_peak(rho: Tensor) -> Peak:
     up to a node and a half: a peak beyond the rim shows as a lag beyond it.
     """
     lags = rho.shape[1:]
-    flat = rho.abs().flatten(1)
+    magnitude = rho.abs()
+    flat = magnitude.flatten(1)
     best = flat.argmax(1)
     centre = _unravel(best, lags)
     inner = torch.stack([c.clamp(1, n - 2) for c, n in zip(centre, lags, strict=True)], 1)
@@ -67,7 +68,7 @@ def find_peak(rho: Tensor) -> Peak:
     value = (_terms(vertex) * (neighbours @ fit.to(neighbours).T)).sum(-1)
     value = value / value.abs().clamp_min(1.0)
     middle = torch.tensor([n // 2 for n in lags], device=rho.device)
-    return Peak(inner - middle + vertex, safe, value, _peak_ratio(rho.abs(), best), concave)
+    return Peak(inner - middle + vertex, safe, value, _peak_ratio(magnitude, best), concave)
 
 
 def _terms(offset: Tensor) -> Tensor:

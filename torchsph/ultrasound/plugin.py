@@ -121,6 +121,6 @@ class LibraryTracker:
         return Estimates(
             velocity=clean, correlation=correlation, peak_ratio=unknown,
             curvature=torch.full_like(clean, torch.nan), variance=torch.full_like(clean, torch.nan),
-            power=unknown, snr=unknown, response=unknown, shear=unknown,
+            power=unknown, snr=unknown, response=unknown, shear=unknown, bend=unknown,
             lag=torch.ones_like(flags), flags=flags,
         )  # fmt: skip

@@ -75,6 +75,13 @@ class SectorImager:
         common = -self.acquisition.phase_per_metre * float(self._lower[-1])
         return self._render(series) * complex(math.cos(common), math.sin(common))
 
+    def noisy_image(
+        self, points: Tensor, amplitude: Tensor, gain: Tensor, noise: float, generator: torch.Generator
+    ) -> Tensor:
+        """See :class:`Imager`."""
+        image = self.image(points, amplitude) * gain
+        return image.add_(self.noise(generator), alpha=math.sqrt(noise)) if noise else image
+
     def noise(self, generator: torch.Generator) -> Tensor:
         """Noise (*shape) of power 1, see :meth:`Convolution.noise`."""
         return self._render(self._convolution.noise(generator))

@@ -13,7 +13,7 @@ from .noise import frame_seed
 from .tracking import SpeckleTracker
 from .training import TrainingPlan, calibrate
 
-BRIGHTEST = 10.0  # dB over the mean of blood: brighter kernels are taken for tissue
+BRIGHTEST = 6.0  # dB over the mean of blood: brighter kernels are taken for tissue
 TRAINING = 0x7EA1  # makes the seed of the calibration's simulations differ from every frame's
 
 
@@ -24,7 +24,7 @@ class SpeckleOptions(ScannerOptions):
 
     kernel: float = 1e-3
     search: float = 1.0
-    training: int = 12
+    training: int = 48
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -32,7 +32,7 @@ class SpeckleOptions(ScannerOptions):
         self.plan()
 
     def tracker(self) -> SpeckleTracker:
-        # a scanner's operator knows about how bright blood is; speckle alone hardly takes a kernel 10 dB above that
+        # a scanner's operator knows about how bright blood is; speckle alone hardly takes a kernel 6 dB above that
         max_snr = self.snr + BRIGHTEST
         return SpeckleTracker(
             kernel=self.kernel, search=self.search, clutter=self.filter(), max_snr=max_snr
@@ -48,7 +48,7 @@ def measure_speckle(
     """What a scanner and a speckle tracker report of ``true``: every K-th frame, with ``weight`` and
     ``sigma``.
 
-    Weight and sigma are fitted on random swirls imaged by the same scanner with other seeds, never on
+    Weight and sigma are fitted on random scenes imaged by the same scanner with other seeds, never on
     ``true``. Flagged estimates have weight and velocity 0. Raises ValueError where beam and recording
     differ in dimension.
     """

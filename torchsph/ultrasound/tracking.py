@@ -15,8 +15,9 @@ import torch
 from torch import Tensor
 
 from .acquisition import Acquisition, Packet, decibel
+from .backends import NAMES, backend
 from .clutter import ClutterFilter, FIRFilter
-from .correlation import ImagePairs, KernelShape
+from .correlation import KernelShape
 from .estimates import Estimates, Flag, bit
 from .gates import gates
 from .motion import Motion, find_motion
@@ -44,9 +45,11 @@ class SpeckleTracker:
     min_blood: least share of the unfiltered power that passes the filter, dB, or ``None``.
     min_response: least response of the clutter filter at the estimate's own Doppler frequency, dB, or ``None``.
     min_correlation: least correlation; lone_correlation: the same where no longer lag confirms the first,
-        whose axial phase may then be a whole turn off. Both are of the echoes without their noise: where that
-        is known, echoes that make up a share s of the power need s times as much, but at least 0.5.
-    tile: points correlated at a time, which bounds memory.
+        whose axial phase may then be a whole turn off. Both are of what noise and shear leave: echoes that make
+        up a share s of the power need s times as much, and so do those of which shear (where it is followed)
+        leaves a share s of the correlation; but at least 0.5.
+    tile: points worked on at a time, which bounds memory.
+    backend: who does the sums: "cpu", compiled code, "reference", torch on any device, or "auto".
     """
 
     kernel: float = 1e-3
@@ -62,7 +65,8 @@ class SpeckleTracker:
     min_response: float | None = -12.0
     min_correlation: float = 0.8
     lone_correlation: float = 0.9
-    tile: int = 32
+    tile: int = 512
+    backend: str = "auto"
 
     def __post_init__(self) -> None:
         for name in ("kernel", "search"):
@@ -70,6 +74,8 @@ class SpeckleTracker:
                 raise ValueError(f"{name} must be positive and finite, got {getattr(self, name)!r}")
         if self.min_samples < 3 or self.tile < 1:
             raise ValueError("min_samples must be >= 3 and tile >= 1")
+        if self.backend not in NAMES:
+            raise ValueError(f"backend must be one of {', '.join(NAMES)}, got {self.backend!r}")
         if not self.lags or list(self.lags) != sorted(set(self.lags)) or self.lags[0] < 1:
             raise ValueError(f"lags must be increasing whole numbers >= 1, got {self.lags!r}")
         for name in ("min_correlation", "lone_correlation"):
@@ -87,31 +93,31 @@ def track(packet: Packet, points: Tensor, options: SpeckleTracker) -> Estimates:
         packet, options.clutter, kernel=options.kernel, min_samples=options.min_samples,
         reach=options.search * packet.acquisition.interval * options.lags[0],
         least_images=1 + options.lags[0], follow_shear=options.follow_shear,
+        backend=backend(options.backend, packet.iq.device),
     )  # fmt: skip
     nodes, beam = images.nearest_nodes(points), images.directions(points)
-    pairs = [images.pairs(lag) for lag in options.lags if lag < images.volume.shape[-1]]
     starts = range(0, max(len(points), 1), options.tile)
     tiles = [slice(start, start + options.tile) for start in starts]
-    return Estimates.joined([_track_tile(images, pairs, nodes[tile], beam[tile], options) for tile in tiles])
+    return Estimates.joined([_track_tile(images, nodes[tile], beam[tile], options) for tile in tiles])
 
 
-def _track_tile(
-    images: Prepared, pairs: list[ImagePairs], nodes: Tensor, beam: Tensor, options: SpeckleTracker
-) -> Estimates:
+def _track_tile(images: Prepared, nodes: Tensor, beam: Tensor, options: SpeckleTracker) -> Estimates:
     """Estimates at a tile of nodes (P, 3); only those that pass the gates are correlated."""
-    corner = images.corner(nodes)
     snr, share, flags = gates(
-        images, corner,
+        images, nodes,
         min_samples=options.min_samples, min_blood=options.min_blood, min_snr=options.min_snr,
         max_snr=options.max_snr,
     )  # fmt: skip
     axes = list(reversed(images.active))
     packet, interval = images.packet, images.packet.acquisition.interval
     kept = torch.nonzero(flags == 0)[:, 0]
-    motion = _follow(images, pairs, nodes[kept], beam[kept], options)
+    ramp = images.ramp(nodes)
+    within = None if ramp is None else ramp[kept]
+    motion = _follow(images, nodes[kept], beam[kept], within, options)
     velocity = motion.shift[:, axes] / interval
     response = _response((motion.shift * beam[kept]).sum(1), packet.acquisition, options.clutter)
-    flags[kept] = _doubts(velocity, motion, snr[kept], response, options)
+    coherent = _echo_share(snr[kept]) * (1 if within is None else _sheared(motion, within / images.spacing))
+    flags[kept] = _doubts(velocity, motion, coherent, response, options)
 
     def spread(values: Tensor, otherwise: float) -> Tensor:
         return values.new_full((len(nodes), *values.shape[1:]), otherwise).index_copy(0, kept, values)
@@ -121,26 +127,27 @@ def _track_tile(
         peak_ratio=spread(motion.peak_ratio, 1.0), curvature=spread(motion.curvature[:, axes], 0.0),
         # of what was not correlated nothing is known but that it is within the range
         variance=spread(motion.variance[:, axes] / interval**2, options.search**2),
-        power=share, snr=snr, response=spread(response, 0.0), shear=images.shear(corner),
-        lag=spread(motion.lag, pairs[0].apart), flags=flags,
+        power=share, snr=snr, response=spread(response, 0.0), shear=images.shear(ramp, len(nodes)),
+        bend=images.bend(nodes), lag=spread(motion.lag, options.lags[0]), flags=flags,
     )  # fmt: skip
 
 
 def _follow(
-    images: Prepared, pairs: list[ImagePairs], nodes: Tensor, beam: Tensor, options: SpeckleTracker
+    images: Prepared, nodes: Tensor, beam: Tensor, ramp: Tensor | None, options: SpeckleTracker
 ) -> Motion:
     """The first lag searched over the whole range, each further one around what is known by then."""
     corner, wide = images.corner(nodes), images.shape
     motion = find_motion(
-        images, pairs[0], corner, torch.zeros_like(nodes), wide, beam, prior=None, phase=options.phase
-    )
+        images, options.lags[0], corner, torch.zeros_like(nodes), wide, beam,
+        ramp=ramp, prior=None, phase=options.phase,
+    )  # fmt: skip
     narrow = KernelShape(wide.half, tuple(min(s, 1) for s in wide.search))
-    for later in pairs[1:]:
-        offset = (motion.shift * later.apart / images.spacing).round().long()
+    for lag in (lag for lag in options.lags[1:] if lag < images.volume.shape[-1]):
+        offset = (motion.shift * lag / images.spacing).round().long()
         fits = images.holds(nodes + offset)
         offset = torch.where(fits[:, None], offset, 0)
         found = find_motion(
-            images, later, corner, offset, narrow, beam, prior=motion, phase=options.phase
+            images, lag, corner, offset, narrow, beam, ramp=ramp, prior=motion, phase=options.phase
         )
         motion = motion.better(found, fits)
     return motion
@@ -154,10 +161,27 @@ def _response(axial: Tensor, acquisition: Acquisition, clutter: ClutterFilter | 
     return decibel(torch.from_numpy(clutter.response(frequency)).clamp_min(1e-12)).to(axial)
 
 
+def _echo_share(snr: Tensor) -> Tensor:
+    """Share (P,) of the power that is not noise, from power over noise, dB; 1 where that is unknown."""
+    return torch.nan_to_num(1 - 10 ** (-snr / 10), nan=1.0)
+
+
+def _sheared(motion: Motion, gradient: Tensor) -> Tensor:
+    """Correlation (P,) that the true lag has left where echoes turn by ``gradient`` (P, 3), rad/m per image.
+
+    Turning a kernel's samples back does nothing about the scatterers within one sample: a Gaussian point spread
+    of amplitude deviation s keeps exp(-g^2 s^2 / 4) of its correlation (the transform of its intensity at g,
+    between two images), and the curvature of the correlation's peak is 1 / (2 s^2).
+    """
+    turned = gradient * motion.lag[:, None]
+    exponent = torch.where(motion.curvature > 0, turned.square() / (8 * motion.curvature.clamp_min(1e-12)), 0)
+    return torch.exp(-exponent.sum(1))
+
+
 def _doubts(
-    velocity: Tensor, motion: Motion, snr: Tensor, response: Tensor, options: SpeckleTracker
+    velocity: Tensor, motion: Motion, coherent: Tensor, response: Tensor, options: SpeckleTracker
 ) -> Tensor:
-    """Flags (P,) of correlated points; velocity (P, D) m/s, power over noise (P,) and response (P,), dB."""
+    """Flags (P,) of correlated points; velocity (P, D) m/s, correlation to be expected (P,), response (P,), dB."""
     flags = bit(~motion.sound, Flag.FLAT)
     # a fit that overshoots by 2 % of the range is still the range's own edge
     flags |= bit((velocity.abs() > options.search * 1.02).any(1) & motion.sound, Flag.EDGE)
@@ -168,6 +192,5 @@ def _doubts(
     least = torch.where(
         alone, max(options.lone_correlation, options.min_correlation), options.min_correlation
     )
-    echoes = torch.nan_to_num(1 - 10 ** (-snr / 10), nan=1.0)  # share of the power that is not noise
     floor = min(LEAST_CORRELATION, options.min_correlation)
-    return flags | bit(motion.correlation < (least * echoes).clamp_min(floor), Flag.DECORRELATED)
+    return flags | bit(motion.correlation < (least * coherent).clamp_min(floor), Flag.DECORRELATED)

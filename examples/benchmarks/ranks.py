@@ -1,0 +1,144 @@
+"""One and two processes of one thread each on the same assimilation: wall-clock, CPU seconds, and what bounds the gain.
+
+    python examples/benchmarks/ranks.py [--quick] [--json FILE] [--members N ...] [--frames N] [--repeats N]
+
+Runs `torchsph assimilate`'s ensemble (with its splines and its run without data) on the sample under torchrun, with one
+process and with two in turn, and compares the analyses bit for bit. Of the repeats the fastest counts.
+
+    wall      s from the reading of the recording to the end, without the start of Python (`launch`)
+    CPU       s of each process
+    bound     what the ratio of the walls would be on cores that nobody else uses: the CPU seconds of one process over
+              those of the critical path of two, where from one exchange to the next the slower one counts
+    repeated  share of one process's seconds that both processes spend
+"""
+
+import argparse
+import hashlib
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+
+import torch
+import torch.distributed as dist
+
+import geometry
+from torchsph import parallel, pipeline
+from torchsph.data import sample_measurement
+
+EXCHANGES = ("all_gather", "all_gather_object", "broadcast", "broadcast_object_list", "barrier")
+
+
+class Segments:
+    """CPU seconds of this process from one exchange with the others to the next."""
+
+    def __init__(self) -> None:
+        self.seconds: list[float] = []
+        self.began, self.inside = time.process_time(), False
+        for name in EXCHANGES:
+            setattr(dist, name, self._counting(getattr(dist, name)))
+
+    def close(self) -> None:
+        self.seconds.append(time.process_time() - self.began)
+
+    def _counting(self, exchange):
+        def counted(*given, **named):
+            if self.inside:  # some exchanges are made of others
+                return exchange(*given, **named)
+            self.close()
+            self.inside = True
+            try:
+                return exchange(*given, **named)
+            finally:
+                self.inside, self.began = False, time.process_time()
+
+        return counted
+
+
+def work(members: int, frames: int, out: Path) -> None:
+    """One process's part; the first one writes what all of them measured."""
+    torch.set_num_threads(1)
+    with parallel.joined():
+        segments, began = Segments(), time.perf_counter()
+        measured = geometry.read_recording(sample_measurement())
+        measured = measured.select(slice(measured.frames - frames, measured.frames))
+        run = pipeline.run_methods(measured, ["ensemble"], members=members)["ensemble"].recording
+        segments.close()
+        wall, everyone = time.perf_counter() - began, [segments.seconds]
+        if dist.is_initialized():
+            everyone = [None] * dist.get_world_size()
+            dist.all_gather_object(everyone, segments.seconds)
+    if parallel.is_lead():
+        digest = hashlib.sha256(run.velocity.tobytes() + run.sigma.tobytes()).hexdigest()
+        out.write_text(json.dumps({"wall": wall, "segments": everyone, "digest": digest}))
+
+
+def launched(processes: int, members: int, frames: int) -> dict:
+    """A run under torchrun."""
+    command = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node", str(processes), __file__]
+    with tempfile.TemporaryDirectory() as folder:
+        out, began = Path(folder) / "out.json", time.perf_counter()
+        given = ["--worker", str(out), "--members", str(members), "--frames", str(frames)]
+        environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+        subprocess.run([sys.executable, *command, *given], check=True, env=environment, capture_output=True)
+        found = json.loads(out.read_text())
+    parts = found.pop("segments")
+    found["launch"] = time.perf_counter() - began - found["wall"]
+    found["cpu"] = [sum(part) for part in parts]
+    found["critical"] = sum(max(each) for each in zip(*parts, strict=True))
+    return found
+
+
+def compared(members: int, frames: int, repeats: int) -> dict:
+    """The fastest of several runs with one process and with two."""
+    runs = {1: [], 2: []}
+    for _ in range(repeats):
+        for processes, found in runs.items():
+            found.append(launched(processes, members, frames))
+    one, two = (min(found, key=lambda run: run["wall"]) for found in runs.values())
+    alone = min(run["cpu"][0] for run in runs[1])
+    critical = min(run["critical"] for run in runs[2])
+    spent = min(sum(run["cpu"]) for run in runs[2])
+    same = len({run["digest"] for found in runs.values() for run in found}) == 1
+    return {
+        "members": members, "frames": frames, "wall": [one["wall"], two["wall"]], "ratio": one["wall"] / two["wall"],
+        "cpu": alone, "cpu_of_two": two["cpu"], "critical": critical, "bound": alone / critical,
+        "repeated": spent / alone - 1.0, "launch": [one["launch"], two["launch"]], "same_bits": same,
+    }  # fmt: skip
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="five frames, 16 members, one run of each")
+    parser.add_argument("--json", type=Path)
+    parser.add_argument("--members", type=int, nargs="+", default=[16, 32, 64])
+    parser.add_argument("--frames", type=int, default=16)
+    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--worker", type=Path, help=argparse.SUPPRESS)
+    args = parser.parse_args()
+    if args.worker is not None:
+        work(args.members[0], args.frames, args.worker)
+        return
+    if args.quick:
+        args.members, args.frames, args.repeats = [16], 5, 1
+    rows = []
+    print("members    one s    two s    ratio   CPU of one   of two            bound  repeated  same bits")
+    for members in args.members:
+        row = compared(members, args.frames, args.repeats)
+        rows.append(row)
+        one, two = row["wall"]
+        each = " + ".join(f"{seconds:.1f}" for seconds in row["cpu_of_two"])
+        same = "yes" if row["same_bits"] else "NO"
+        print(f"{members:7d} {one:8.1f} {two:8.1f} {row['ratio']:8.2f} {row['cpu']:12.1f}   {each:15s} "
+              f"{row['bound']:7.2f} {100 * row['repeated']:7.0f} %  {same}", flush=True)
+    if args.json:
+        args.json.write_text(json.dumps(rows, indent=1))
+
+
+if __name__ == "__main__":
+    main()
