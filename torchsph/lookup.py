@@ -10,9 +10,7 @@ from torch.nn import functional
 
 from geometry import Grid
 
-from .pairs.native import LibraryMissing, LookUpArguments, library
-
-_REALS = {torch.float32: "f32", torch.float64: "f64"}
+from .pairs.native import REALS, LibraryMissing, LookUpArguments, library
 
 
 class LookUp:
@@ -103,10 +101,10 @@ class LookUp:
 
 def _compiled_function(rows: Tensor) -> ctypes._CFuncPtr | None:
     """Compiled look-up for rows of this type and place; None where there is none, and torch has to do."""
-    if rows.device.type != "cpu" or rows.dtype not in _REALS:
+    if rows.device.type != "cpu" or rows.dtype not in REALS:
         return None
     try:
-        return library().function("look_up", _REALS[rows.dtype])
+        return library().function("look_up", REALS[rows.dtype])
     except LibraryMissing:
         return None
 

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from .pairs.interface import PRESSURE_FORMS, per_particle
-from .pairs.native import LibraryMissing, WallArguments, library
+from .pairs.native import REALS, LibraryMissing, WallArguments, address, library
 from .walls import (
     SMALLEST_FRICTION_DISTANCE,
     SMALLEST_SHARE,
@@ -22,8 +22,6 @@ from .walls import (
     friction,
     wall_pressure_force,
 )
-
-_REALS = {torch.float32: "f32", torch.float64: "f64"}
 
 
 def complete_rates(
@@ -37,8 +35,8 @@ def complete_rates(
     crowding = None if crowding is None else crowding.contiguous()
     whole, even = torch.empty_like(divergence), None if crowding is None else torch.empty_like(crowding)
     code.sph_wall_rates(_arguments(
-        wall, velocity, velocity=velocity.data_ptr(), divergence=divergence.data_ptr(), crowding=_address(crowding),
-        whole_divergence=whole.data_ptr(), whole_crowding=_address(even),
+        wall, velocity, velocity=velocity.data_ptr(), divergence=divergence.data_ptr(), crowding=address(crowding),
+        whole_divergence=whole.data_ptr(), whole_crowding=address(even),
     ))
     return whole, even
 
@@ -61,9 +59,9 @@ def complete_forces(
     nu = None if viscosity is None else torch.as_tensor(viscosity, dtype=torch.float64).reshape(-1).contiguous()
     out, member = torch.empty_like(acceleration), member.contiguous()
     code.sph_wall_forces(_arguments(
-        wall, velocity, velocity=velocity.data_ptr(), form=PRESSURE_FORMS.index(form), pressure=_address(given[0]),
-        deviation=_address(given[1]),
-        viscosity=_address(nu), viscosities=0 if nu is None else nu.numel(), member=member.data_ptr(),
+        wall, velocity, velocity=velocity.data_ptr(), form=PRESSURE_FORMS.index(form), pressure=address(given[0]),
+        deviation=address(given[1]),
+        viscosity=address(nu), viscosities=0 if nu is None else nu.numel(), member=member.data_ptr(),
         acceleration=acceleration.data_ptr(), whole_acceleration=out.data_ptr(),
     ))
     return out
@@ -120,7 +118,7 @@ class _Code:
 def _code(dtype: torch.dtype) -> _Code | None:
     """Looked up once, for every step asks several times; None: no such precision, or nothing was compiled."""
     try:
-        return _Code(_REALS[dtype]) if dtype in _REALS else None
+        return _Code(REALS[dtype]) if dtype in REALS else None
     except LibraryMissing:
         return None
 
@@ -143,7 +141,3 @@ def _arguments(wall: WallSample, vectors: Tensor, **arrays: int | float | None) 
         dimension=vectors.shape[1], threads=torch.get_num_threads(), count=count, channels=channels,
         rows=wall.rows.data_ptr(), smallest_share=SMALLEST_SHARE, smallest_gap=SMALLEST_FRICTION_DISTANCE, **arrays,
     ))
-
-
-def _address(tensor: Tensor | None) -> int | None:
-    return None if tensor is None else tensor.data_ptr()

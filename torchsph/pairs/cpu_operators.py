@@ -15,17 +15,18 @@ from torch import Tensor
 
 from . import plan
 from .native import (
+    REALS,
     InterpolationArguments,
     ListArguments,
     PassArguments,
     PoissonArguments,
     SearchArguments,
     Sizes,
+    address,
     library,
 )
 
 CLUSTER = 8
-_REALS = {torch.float32: "f32", torch.float64: "f64"}
 _OPERATORS = torch.library.Library("torchsph", "FRAGMENT")
 
 
@@ -43,10 +44,6 @@ def _operator(fake: Callable[..., Any], mutates: Sequence[str] = ()) -> Callable
         return getattr(torch.ops.torchsph, name).default
 
     return register
-
-
-def _address(tensor: Tensor | None) -> int | None:
-    return None if tensor is None else tensor.data_ptr()
 
 
 def _period(period: Sequence[float]) -> ctypes.Array:
@@ -78,7 +75,7 @@ def cluster_lists(
     Raises:
         ValueError: a position is not finite, or a member index is negative.
     """
-    reals, code = _REALS[position.dtype], library()
+    reals, code = REALS[position.dtype], library()
     given = _search_arguments(position, member, radius, period)
     sizes = Sizes()
     code.function("sort", reals)(ctypes.byref(given), ctypes.byref(sizes))
@@ -163,7 +160,7 @@ def pair_pass(
     )
     for name, output in zip(plan.Pass(terms, weight).outputs, outputs, strict=True):
         setattr(given, name, output.data_ptr())
-    if library().function("pass", _REALS[position.dtype])(ctypes.byref(given)):
+    if library().function("pass", REALS[position.dtype])(ctypes.byref(given)):
         raise NotImplementedError(f"no compiled pass has exactly the terms {terms:#x}")
     return outputs
 
@@ -181,8 +178,8 @@ def _pass_arguments(
         kernel=kind, support=kernel[0], sigma=kernel[1], particles=position.shape[0], clusters=owner.shape[0],
         slot=slot.data_ptr(), owner=owner.data_ptr(), entries=entries.data_ptr(), offset=offset.data_ptr(),
         home=home.data_ptr() if home.numel() else None, period=_period(period), coefficients=coefficients.data_ptr(),
-        position=position.data_ptr(), velocity=_address(velocity), mass=mass.data_ptr(), deviation=deviation.data_ptr(),
-        pressure=_address(pressure), slope=_address(slope), field=_address(field), active=_address(active),
+        position=position.data_ptr(), velocity=address(velocity), mass=mass.data_ptr(), deviation=deviation.data_ptr(),
+        pressure=address(pressure), slope=address(slope), field=address(field), active=address(active),
     )
 
 
@@ -207,12 +204,12 @@ def poisson(
     count = torch.empty(groups, dtype=torch.int64)
     residual, mismatch = (torch.empty(groups, dtype=torch.float64) for _ in range(2))
     arguments = PoissonArguments(
-        pass_=given, source=source.data_ptr(), start=_address(start), free=free.data_ptr(),
+        pass_=given, source=source.data_ptr(), start=address(start), free=free.data_ptr(),
         singular=singular.data_ptr(), member=group.data_ptr(), members=groups, iterations=iterations,
         tolerance=tolerance, values=values.data_ptr(), count=count.data_ptr(), residual=residual.data_ptr(),
         mismatch=mismatch.data_ptr(), converged=converged.data_ptr(),
     )
-    library().function("poisson", _REALS[position.dtype])(ctypes.byref(arguments))
+    library().function("poisson", REALS[position.dtype])(ctypes.byref(arguments))
     return [values, count, residual, converged, mismatch]
 
 
@@ -265,9 +262,9 @@ def interpolation_moments(
         kernel[1],
         lengths.data_ptr(),
         *(output.data_ptr() for output in outputs),
-        _address(weight),
+        address(weight),
     )
-    unusable = library().function("interpolate", _REALS[position.dtype])(ctypes.byref(arguments))
+    unusable = library().function("interpolate", REALS[position.dtype])(ctypes.byref(arguments))
     if unusable:
         raise ValueError(
             f"{unusable} particle or query positions are not finite, or their member does not exist"

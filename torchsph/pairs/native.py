@@ -8,12 +8,22 @@ from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
+import torch
+from torch import Tensor
+
 from . import build
 
 PREFERENCE = ("avx512", "avx2", "baseline")
 FORCED = "TORCHSPH_ISA"
+# what is compiled, and how its functions' names end
+REALS = {torch.float32: "f32", torch.float64: "f64"}
 
 _pointer, _int, _long, _real = ctypes.c_void_p, ctypes.c_int32, ctypes.c_int64, ctypes.c_double
+
+
+def address(tensor: Tensor | None) -> int | None:
+    """Where a tensor's numbers begin; null for None."""
+    return None if tensor is None else tensor.data_ptr()
 
 
 class SearchArguments(ctypes.Structure):

@@ -8,10 +8,9 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from ..pairs.native import library
+from ..pairs.native import REALS, library
 from .correlation import KernelShape, check_apart
 
-_REALS = {torch.float32: "f32", torch.float64: "f64"}
 _pointer, _int, _long = ctypes.c_void_p, ctypes.c_int32, ctypes.c_int64
 _Triple = _long * 3
 
@@ -58,7 +57,7 @@ def _call(name: str, dtype: torch.dtype, **arguments: object) -> None:
         key: value.data_ptr() if isinstance(value, Tensor) else _Triple(*value) if isinstance(value, tuple) else value
         for key, value in arguments.items()
     }
-    function = library().function(name, _REALS[dtype])
+    function = library().function(name, REALS[dtype])
     function.restype = None
     function(ctypes.byref(_STRUCTURES[name](threads=torch.get_num_threads(), **plain)))
 
