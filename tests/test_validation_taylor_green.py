@@ -55,10 +55,10 @@ def test_taylor_green_2d_by_projection_at_fine_spacings(resolution, error):
 
 
 def test_what_the_ventricles_preset_costs_a_vortex():
-    """Its shifting is for walls and valves: 1.5 times the error of the options for periodic flows at most, at 40^2."""
+    """Its relaxation and shifting are for jets that fill a chamber: at most 1.9 times the error, at 40^2."""
     scheme = preset("projection", max_step=None)
     changes = {"relaxation": scheme.relaxation, "shifting": scheme.shifting}
-    assert 1.0 < projected_error(40, **changes) / projected_error(40) < 1.6
+    assert 1.0 < projected_error(40, **changes) / projected_error(40) < 1.9
 
 
 @pytest.mark.slow

@@ -100,7 +100,7 @@ def test_a_source_pushes_as_the_changing_flux_demands(scene):
     place = (centre + radius * direction) / units.length
 
     class Particle:
-        position = place
+        position, member = place, torch.zeros(1, dtype=torch.int64)
 
     push = sources.acceleration(Particle, (1,), torch.tensor([time], dtype=torch.float64))
     outward = float((push * direction).sum()) * units.acceleration
@@ -114,6 +114,7 @@ def test_a_source_stays_finite_at_its_centre(scene):
 
     class Particle:
         position = torch.tensor([[VENTRICLE.mitral_centre[0], 0.0, 0.0]], dtype=torch.float64) / scene.spacing
+        member = torch.zeros(1, dtype=torch.int64)
 
     assert torch.isfinite(sources.acceleration(Particle, (1,), torch.tensor([0.3]).double())).all()
 

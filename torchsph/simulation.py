@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from .simulator import Simulator
 
 # how far particles move before the neighbours are searched again, in spacings
-_SEARCH_MARGIN = 0.12
+_SEARCH_MARGIN = 0.25
 # from so many particles on they are sorted in space, every so many searches: smaller sets fit into the caches anyway
 _SORT_FROM, _SORT_EVERY = 50_000, 8
 # a member that would need more steps than this for the rest of an interval has broken down
