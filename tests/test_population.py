@@ -126,7 +126,8 @@ def after_steps(scheme, options, dimension, what, centre, every):
 @pytest.mark.parametrize(
     ("scheme", "options", "dimension"),
     [("weakly_compressible", {"sound_speed": 10.0, "shifting": None}, 2),
-     ("projection", {"shifting": None, "relaxation": 2.0}, 2), ("projection", {"shifting": None, "relaxation": 2.0}, 3)],
+     ("projection", {"shifting": None, "relaxation": 2.0}, 2),
+     ("projection", {"shifting": None, "relaxation": 2.0}, 3)],
 )
 def test_a_hole_closes_and_a_crowd_thins_while_the_flow_goes_on(scheme, options, dimension):
     """Within forty steps, over the seams of the box too; without the control both are still there.
