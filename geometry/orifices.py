@@ -53,12 +53,7 @@ class OrificePlane:
         Exact for the polygon. Cost is points times rim edges; narrow the points down by `height` first where
         many lie far away.
         """
-        place = self.lateral(points)
-        rim = points.new_tensor(self.outline)
-        if place.shape[1] == 1:
-            return torch.minimum(place[:, 0] - rim.min(), rim.max() - place[:, 0])
-        start, end = rim[torch.as_tensor(self.edges.T, device=points.device)]
-        return _polygon_distance(place, start, end)
+        return rim_distance(self.lateral(points), points.new_tensor(self.outline), torch.from_numpy(self.edges))
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,6 +151,14 @@ def _rim_edges(faces: np.ndarray, label: int) -> np.ndarray:
     if not loops:
         raise SurfaceError(f"region {label} has no rim: it covers a closed surface")
     return np.concatenate([np.column_stack([loop, np.roll(loop, -1)]) for loop in loops])
+
+
+def rim_distance(place: Tensor, outline: Tensor, edges: Tensor) -> Tensor:
+    """Distance of points `(n, D - 1)` in an opening to its rim, `(n,)`, positive inside: see `OrificePlane`."""
+    if place.shape[1] == 1:
+        return torch.minimum(place[:, 0] - outline.min(), outline.max() - place[:, 0])
+    start, end = outline[edges.T.to(outline.device)]
+    return _polygon_distance(place, start, end)
 
 
 def _polygon_distance(place: Tensor, start: Tensor, end: Tensor) -> Tensor:

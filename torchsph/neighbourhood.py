@@ -12,7 +12,7 @@ from torch import Tensor
 
 from .components import components
 from .neighbours import PairSearch
-from .pairs.interface import MomentumTerms, Rates, RateTerms, Support
+from .pairs.interface import MomentumTerms, Rates, RateTerms, Support, inner, square_length
 from .pairs.poisson import PoissonSolution
 from .particles import Particles
 from .wall_pass import complete_rates
@@ -82,16 +82,16 @@ class Neighbourhood:
         noise at their edges.
         """
         p, wall = self.particles, self.wall
-        steep = wall.share_gradient.norm(dim=1)
+        steep = square_length(wall.share_gradient).sqrt()
         terms = MomentumTerms(pressure="difference")
-        along = (p.velocity * wall.normal).sum(1)
+        along = inner(p.velocity, wall.normal)
         fall = self.search.backend.momentum(self.pairs, p.state(along), self.support, terms)
         # the sum's own moment across a plane wall, by the divergence theorem
         moment = (wall.share - wall.distance * steep).clamp_min(_SMALLEST_MOMENT)
-        rise = -(fall * wall.normal).sum(1) / moment
-        jump = (wall.velocity * wall.normal).sum(1) - along + wall.distance.clamp_min(0.0) * rise
+        rise = -inner(fall, wall.normal) / moment
+        jump = inner(wall.velocity, wall.normal) - along + wall.distance.clamp_min(0.0) * rise
         # where walls meet at an edge there is no such line to continue on
-        cosine = (wall.share_gradient * wall.normal).sum(1) / steep.clamp_min(_TINY)
+        cosine = inner(wall.share_gradient, wall.normal) / steep.clamp_min(_TINY)
         plain = (cosine - _EDGE).clamp_min(0.0) / (1.0 - _EDGE)
         return torch.where(p.fluid, plain * jump * steep / self.share, torch.zeros_like(jump))
 

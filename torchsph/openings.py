@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from geometry import OrificePlane
+from geometry.orifices import rim_distance
 
 from .pairs.interface import square_length
 
@@ -30,6 +31,7 @@ class Frame:
         self.centre, self.normal, self.basis = tensor(self._plane.centroid), tensor(plane.normal), tensor(plane.basis)
         self.area = float(self._plane.area)
         self.velocity = tensor(velocity)
+        self._outline, self._edges = tensor(self._plane.outline), torch.from_numpy(plane.edges).to(device)
         self.radius = float(np.linalg.norm(self._plane.outline, axis=1).max())
         self._clear = float(self.inset(self.centre[None]).clamp_min(0.0))  # nothing of the rim is nearer to the middle
 
@@ -39,7 +41,7 @@ class Frame:
 
     def inset(self, position: Tensor) -> Tensor:
         """In-plane distance from the rim, (n,), positive over the opening."""
-        return self._plane.lateral_distance(position)
+        return rim_distance((position - self.centre) @ self.basis.T, self._outline, self._edges)
 
     def cover(self, position: Tensor) -> Tensor:
         """Part of points (n, D) over the opening, (n,): blended in over a spacing at the rim."""

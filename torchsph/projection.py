@@ -12,7 +12,7 @@ from .incompressible import Projection
 from .integrate import Surroundings
 from .neighbourhood import Neighbourhood
 from .neighbours import PairSearch
-from .pairs.interface import MomentumTerms, Rates, RateTerms, Support, per_particle
+from .pairs.interface import MomentumTerms, Rates, RateTerms, Support, inner, per_particle
 from .pairs.poisson import PoissonSolution
 from .parameters import Coefficients
 from .particles import Particles
@@ -193,5 +193,5 @@ class ProjectionStepper:
 
 def _earlier(wall: WallSample, half: Tensor, velocity: Tensor) -> WallSample:
     """Walls seen half a step later, with the distance that there was before, to first order: ``half`` (N, 1), time."""
-    way = (half * (velocity - wall.velocity) * wall.normal).sum(1)
+    way = half[:, 0] * inner(velocity - wall.velocity, wall.normal)
     return replace(wall, distance=wall.distance - way)
