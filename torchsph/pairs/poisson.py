@@ -70,6 +70,8 @@ def solve(
 ) -> PoissonSolution:
     """Conjugate gradients with the diagonal as preconditioner, each member until its own residual is small.
 
+    The compiled solver (csrc/poisson.hpp) has a coarse level beside it: the same answer from half of the iterations.
+
     Sums run in double precision, the rest in that of ``source``. A member that is done, or whose numbers are not
     finite, is left as it is while the others go on.
 
