@@ -5,20 +5,36 @@ import signal
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+import torch.distributed as dist
 
 import geometry
 from torchsph.data import sample_measurement
+from torchsph.parallel import _round
 
 PACKAGES = Path(geometry.__file__).resolve().parents[1]
 
 
 GIVEN = ("-m", "torchsph", "assimilate", "m.h5", "--spacing", "3e-3", "--members", "3", "--resume", "--out")
 TWO = ("-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2")
+
+
+def test_every_start_has_a_name_of_its_own_in_the_store_that_torchrun_keeps():
+    """Also where the last start has ended before all had come, and has left what it wrote behind."""
+    store, names = dist.HashStore(), []
+    store.set("torchsph/hello/1", "gone")
+    store.set("torchsph/hello/2", "gone too")
+    for _ in range(3):
+        with ThreadPoolExecutor(3) as pool:
+            rounds = list(pool.map(lambda rank: _round(store, rank, 3), (0, 1, 2)))
+        assert len(set(rounds)) == 1
+        names += rounds[:1]
+    assert len(set(names)) == 3
 
 
 def launched(folder: Path, *command: str) -> subprocess.Popen:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import time
+import uuid
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import TypeVar
@@ -10,6 +12,9 @@ from typing import TypeVar
 import torch.distributed as dist
 
 T = TypeVar("T")
+
+# s between two looks for processes that have not come yet
+_PAUSE = 0.02
 
 
 def is_lead() -> bool:
@@ -33,11 +38,37 @@ def joined() -> Iterator[None]:
     if int(os.environ.get("WORLD_SIZE", "1")) < 2:
         yield
         return
-    dist.init_process_group("gloo")
+    store, rank, processes = next(dist.rendezvous("env://"))
+    fresh = dist.PrefixStore(_round(store, rank, processes), store)
+    dist.init_process_group("gloo", store=fresh, rank=rank, world_size=processes)
     try:
         yield
     finally:
         dist.destroy_process_group()
+
+
+def _round(store: dist.Store, rank: int, processes: int) -> str:
+    """A name that all processes of this start share, and that no earlier start has used.
+
+    torchrun keeps one store for all its restarts, and gloo would find the addresses of processes that are gone in it.
+    How often it has restarted does not tell one start from another: on two nodes only the one that failed counts.
+    So the first process answers each of the others under a name that only this one can have chosen.
+    """
+    own = uuid.uuid4().hex
+    if rank:
+        store.set(f"torchsph/hello/{rank}", own)
+        name = store.get(f"torchsph/answer/{own}").decode()
+        store.set(f"torchsph/here/{name}/{rank}", own)
+        return name
+    missing = set(range(1, processes))
+    while missing:
+        for other in sorted(missing):
+            # which may still be what an earlier start has left behind: then nobody waits for the answer
+            asked = store.get(f"torchsph/hello/{other}").decode()
+            store.set(f"torchsph/answer/{asked}", own)
+        missing = {other for other in missing if not store.check([f"torchsph/here/{own}/{other}"])}
+        time.sleep(_PAUSE)
+    return own
 
 
 def is_last() -> bool:
