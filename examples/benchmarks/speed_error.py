@@ -28,8 +28,8 @@ Measured (results/speed_error.json and .png; the ventricle is a CFD phantom, one
 - plane: .0065 and .0056 at 40^2 and 60^2 with the projection's options for periodic flows in .34 and 1.2 s, against
   .0112 and .0057 in .70 and 1.4 s; at 20^2 .058 against .032. Its preset does not converge there: its relaxation stirs.
 - space: .0129 and .0057 at 20^3 and 24^3 in .9 and 1.8 s, against .0157 and .0166 in 1.8 and 3.8 s.
-- pipe: .0037 .0043 .0041 with the options for periodic flows against .0035 .0043 .0040 of the weakly compressible preset,
-  in two to three times its time; channel: equal errors, three to four times slower: little sound to save.
+- pipe: .0037 .0043 .0041 with the options for periodic flows against .0035 .0043 .0040 of the weakly compressible
+  preset, in two to three times its time; channel: equal errors, three to four times slower: little sound to save.
 
 The default preset is therefore the projection. PySPH's vortex: peers_vortex.py.
 """
