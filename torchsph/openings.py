@@ -24,15 +24,15 @@ class Frame:
         def tensor(value: np.ndarray) -> Tensor:
             return torch.as_tensor(np.ascontiguousarray(value), dtype=dtype, device=device)
 
-        self._plane = OrificePlane(
+        plane = OrificePlane(
             plane.centroid / length, plane.normal, plane.area / length ** len(plane.basis), plane.basis,
             plane.rim / length, plane.edges,
         )
-        self.centre, self.normal, self.basis = tensor(self._plane.centroid), tensor(plane.normal), tensor(plane.basis)
-        self.area = float(self._plane.area)
+        self.centre, self.normal, self.basis = tensor(plane.centroid), tensor(plane.normal), tensor(plane.basis)
+        self.area = float(plane.area)
         self.velocity = tensor(velocity)
-        self._outline, self._edges = tensor(self._plane.outline), torch.from_numpy(plane.edges).to(device)
-        self.radius = float(np.linalg.norm(self._plane.outline, axis=1).max())
+        self._outline, self._edges = tensor(plane.outline), torch.from_numpy(plane.edges).to(device)
+        self.radius = float(np.linalg.norm(plane.outline, axis=1).max())
         self._clear = float(self.inset(self.centre[None]).clamp_min(0.0))  # nothing of the rim is nearer to the middle
 
     def height(self, position: Tensor) -> Tensor:

@@ -18,7 +18,7 @@ from .neighbourhood import Neighbourhood, divergence_free
 from .neighbours import PairSearch
 from .pairs import backend as choose_backend
 from .parameters import Coefficients, Parameters
-from .particles import Particles
+from .particles import Particles, held, held_rows
 from .population import Population
 from .pressure_valves import PressureValves
 from .projection import ProjectionStepper, check_filled
@@ -241,7 +241,7 @@ class Simulation:
         after = self.domain.constrain(before, stepped, wall, inner, self.record)
         waiting = step == 0
         if bool(waiting.any()):
-            after, acceleration = _held(waiting, before, after), _held_rows(waiting, before, push, acceleration)
+            after, acceleration = held(waiting, before, after), held_rows(waiting, before, push, acceleration)
         self.particles, self._acceleration, done = after, acceleration, done + step
         broken = self._broken() & ~self.record.failed
         if self._work is not None:
@@ -278,8 +278,8 @@ class Simulation:
                 broken, self.particles, self._acceleration, done
             )
         else:
-            self._acceleration = _held_rows(broken, before, push, self._acceleration)
-            self.particles = _held(broken, before, self.particles)
+            self._acceleration = held_rows(broken, before, push, self._acceleration)
+            self.particles = held(broken, before, self.particles)
         self._fail(broken)
         return done
 
@@ -387,17 +387,3 @@ class Simulation:
         covered[:, node] = found.covered.reshape(self.members, len(node))
         shape = grid.shape
         return Fetched(value.reshape(self.members, dimension, *shape), covered.reshape(self.members, *shape))
-
-
-def _held_rows(members: Tensor, particles: Particles, before: Tensor, after: Tensor) -> Tensor:
-    """``before`` for the particles of some members (members,) bool, ``after`` for the others; (N, ...)."""
-    mine = members[particles.member]
-    return torch.where(mine.reshape(-1, *[1] * (after.ndim - 1)), before, after)
-
-
-def _held(members: Tensor, before: Particles, after: Particles) -> Particles:
-    """``after`` with the state of some members (members,) bool as it was before."""
-    keep = {n: getattr(after, n) for n in ("position", "velocity", "deviation")}
-    if before.pressure is not None:
-        keep["pressure"] = after.pressure
-    return after.changed(**{n: _held_rows(members, after, getattr(before, n), value) for n, value in keep.items()})

@@ -175,7 +175,7 @@ def ventricle(
     model = Simulator(Scene.from_recording(recording, 1e-3 * resolution), scheme, backend=backend)
     every = recording.frames if quick else max(recording.frames // 8, 1)
     leads = (0.01,) if quick else (0.01, 0.02, 0.04)
-    skill(recording, model, leads, every=every)  # makes the walls' tables
+    model.domain.prepare_until(float(recording.time[0]), float(recording.time[-1]))  # the walls' tables
     steps = 0.0
 
     def action() -> float:

@@ -173,41 +173,28 @@ template <class Real, int D> class CoarseLevel {
       for (int l = 0; l < L::own; ++l)
         weight[l] = slot[l] >= 0 && free[slot[l]] ? mass[slot[l]] * 2 * per_slope : Real(0);
       const V mine = L::load_own(weight);
-      typename Sums::Own a;
-      for (int f = 0; f < at.fields; ++f) a.field[f] = L::load_own(block + f * cluster_size + part * L::own);
-      V home[D];
-      for (int d = 0; d < D; ++d) home[d] = a.field[d];
-      typename Sums::Sums sums;
       V run{};
       std::int32_t to = -1;
-      for (const std::int32_t* list = lists.entries + lists.offset[g]; list[0] >= 0;) {
-        const std::int32_t image = list[0], count = list[1];
-        Sums::move(a, home, image, lists);
-        list += 2;
-        for (std::int32_t n = 0; n < count; n += L::partners) {
-          const Partner<Real, at.fields> b(rows.row.data(), list + n, at.stride());
-          const V before = sums.diagonal;
-          sums.diagonal = V{};
-          Sums::add(k, a, b, sums);
-          const V pull = mine * sums.diagonal * b.field(at.fields);
-          sums.diagonal += before;
-          const std::int32_t next = r.of_cluster[list[n] / cluster_size];
-          bool same = next == to;
-          if constexpr (L::partners == 2) {
-            const std::int32_t last = r.of_cluster[list[n + 1] / cluster_size];
-            if (last != next) {
-              take(pull, next, last, row);
-              continue;
-            }
-          }
-          if (!same) {
-            if (to >= 0) take(run, to, to, row);
-            run = V{}, to = next;
-          }
-          run += pull;
+      // What they have of one aggregate stands together in the list and is taken at once; inlined, for its registers.
+      const auto each = [&](const typename Sums::Own& a, const auto& b, const std::int32_t* entry, auto& into) __attribute__((always_inline)) {
+        const V before = into.diagonal;
+        into.diagonal = V{};
+        Sums::add(k, a, b, into);
+        const V pull = mine * into.diagonal * b.field(at.fields);
+        into.diagonal += before;
+        const std::int32_t next = r.of_cluster[entry[0] / cluster_size];
+        const std::int32_t last = r.of_cluster[entry[L::partners - 1] / cluster_size];
+        if (last != next) {
+          take(pull, next, last, row);
+          return;
         }
-        list += count;
-      }
+        if (next != to) {
+          if (to >= 0) take(run, to, to, row);
+          run = V{}, to = next;
+        }
+        run += pull;
+      };
+      const auto sums = Sums::swept(lists, rows, g, part, each);
       if (to >= 0) take(run, to, to, row);
       Real lane[cluster_size];
       L::store_own(lane, sums.diagonal);

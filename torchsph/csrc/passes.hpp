@@ -61,6 +61,26 @@ template <class Real, int D, std::uint32_t T> struct Pass {
             L::all(Real(c.laminar)), L::all(Real(c.tensile)), Real(choice.support), choice.kind};
   }
 
+  // Sums of the particles a of one register of a cluster: each(a, b, entry, sums) takes in the partners b at an entry.
+  template <class Each>
+  static SPH_INLINE Sums swept(const Lists<Real>& lists, const Rows<Real>& rows, std::int64_t g, int group, Each each) {
+    const Real* block = rows.block.data() + g * at.block();
+    Own a;
+    for (int f = 0; f < at.fields; ++f) a.field[f] = L::load_own(block + f * cluster_size + group * L::own);
+    V home[D];
+    for (int d = 0; d < D; ++d) home[d] = a.field[d];
+    Sums sums;
+    for (const std::int32_t* list = lists.entries + lists.offset[g]; list[0] >= 0;) {
+      const std::int32_t image = list[0], count = list[1];
+      move(a, home, image, lists);
+      list += 2;
+      for (std::int32_t n = 0; n < count; n += L::partners)
+        each(a, Partner<Real, at.fields>(rows.row.data(), list + n, at.stride()), list + n, sums);
+      list += count;
+    }
+    return sums;
+  }
+
   // The particles a, whose place is `home`, where a periodic image sees them.
   static SPH_INLINE void move(Own& a, const V* home, std::int32_t image, const Lists<Real>& lists) {
     if (!lists.periodic) return;
@@ -191,19 +211,9 @@ template <class Real, int D, std::uint32_t T> struct Pass {
       const Real per_value = Real(choice.sigma / std::pow(h, D)), per_slope = Real(choice.sigma / std::pow(h, D + 2));
       const Real* block = rows.block.data() + g * at.block();
       for (int group = 0; group < L::groups; ++group) {
-        Own a;
-        for (int f = 0; f < at.fields; ++f) a.field[f] = L::load_own(block + f * cluster_size + group * L::own);
-        V home[D];
-        for (int d = 0; d < D; ++d) home[d] = a.field[d];
-        Sums sums;
-        for (const std::int32_t* list = lists.entries + lists.offset[g]; list[0] >= 0;) {
-          const std::int32_t image = list[0], count = list[1];
-          move(a, home, image, lists);
-          list += 2;
-          for (std::int32_t n = 0; n < count; n += L::partners)
-            add(k, a, Partner<Real, at.fields>(rows.row.data(), list + n, at.stride()), sums);
-          list += count;
-        }
+        const Sums sums = swept(lists, rows, g, group, [&](const Own& a, const auto& b, const std::int32_t*, Sums& into) {
+          add(k, a, b, into);
+        });
         write(sums, lists.slot + g * cluster_size + group * L::own, block + at.factor() * cluster_size + group * L::own,
               per_value, per_slope, outputs);
       }

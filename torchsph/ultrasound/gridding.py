@@ -17,12 +17,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..pairs.native import LibraryMissing, library
+from ..pairs.native import REALS, LibraryMissing, library
 
 CHUNK = 1 << 14  # points spread at a time: their stencils stay in the cache
 
 
-_REALS = {torch.complex64: (torch.float32, "f32"), torch.complex128: (torch.float64, "f64")}
 _pointer, _int, _long, _real = ctypes.c_void_p, ctypes.c_int32, ctypes.c_int64, ctypes.c_double
 
 
@@ -145,12 +144,12 @@ class Gridding:
 
 def _compiled(name: str, points: Tensor, samples: Tensor) -> ctypes._CFuncPtr | None:
     """Compiled sums for complex samples on the CPU; None where torch has to do."""
-    real, suffix = _REALS.get(samples.dtype, (None, ""))
     derived = torch.is_grad_enabled() and (points.requires_grad or samples.requires_grad)
-    if samples.device.type != "cpu" or points.dtype != real or derived:
+    known = points.dtype in REALS and samples.dtype == points.dtype.to_complex()
+    if samples.device.type != "cpu" or not known or derived:
         return None
     try:
-        function = library().function(name, suffix)
+        function = library().function(name, REALS[points.dtype])
     except LibraryMissing:
         return None
     function.restype = None
