@@ -63,9 +63,7 @@ def _compile(script: str, folder: Path) -> list[Path]:
     if not (ROOT / script).is_file():
         return []
     if shutil.which("g++") is None and shutil.which("clang++") is None:
-        _say(
-            f"no C++ compiler found: {script} was not run; install g++ or clang++ and reinstall"
-        )
+        _say(f"no C++ compiler found: {script} was not run; install g++ or clang++ and reinstall")
         return []
     try:
         made = runpy.run_path(str(ROOT / script))["build"](folder)

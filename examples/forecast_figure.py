@@ -97,8 +97,9 @@ def main() -> None:
         rows = {
             f"{name}\nstart, {1e3 * recording.time[frame]:.0f} ms": before,
             f"forecast: {errors[0]:.2f} ({errors[1]:.2f})": field,
-            f"truth, to {top:.2f} m/s": truth, "forecast - truth": field - truth,
-        }  # fmt: skip
+            f"truth, to {top:.2f} m/s": truth,
+            "forecast - truth": field - truth,
+        }
         for axis, (title, one) in zip(axes[:, column], rows.items(), strict=True):
             draw(axis, recording, one, recording.mask[frame] if one is before else mask, row, top)
             axis.set_title(title, fontsize=9)

@@ -30,11 +30,7 @@ WALL_STEP = 2.0**-15  # m/s
 
 def rounded(values: np.ndarray | None, step: float) -> np.ndarray | None:
     """Values to the nearest multiple of a step."""
-    return (
-        None
-        if values is None
-        else (np.round(np.asarray(values, np.float64) / step) * step).astype(values.dtype)
-    )
+    return None if values is None else (np.round(np.asarray(values, np.float64) / step) * step).astype(values.dtype)
 
 
 def stretch(recording: geometry.Recording, step: float) -> geometry.Recording:
@@ -68,9 +64,7 @@ def main(source: Path) -> None:
         total += size
         print(f"{target / out}: {part.frames} frames, {size / 1e6:.2f} MB")
     if total > LIMIT:
-        sys.exit(
-            f"the sample takes {total / 1e6:.2f} MB, more than {LIMIT / 1e6:g} MB: choose a shorter stretch"
-        )
+        sys.exit(f"the sample takes {total / 1e6:.2f} MB, more than {LIMIT / 1e6:g} MB: choose a shorter stretch")
 
 
 if __name__ == "__main__":

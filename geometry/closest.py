@@ -18,9 +18,7 @@ from .search_points import repeated, search_points
 from .surface import Surface
 
 FIRST_LOOK = 8  # vertices per point at first; measured: 4 and 12 are 10 to 20 % slower
-LAST_LOOK = (
-    1536  # where more are equally near, as at the centre of a sphere, h^2 / (2 distance) bounds the error
-)
+LAST_LOOK = 1536  # where more are equally near, as at the centre of a sphere, h^2 / (2 distance) bounds the error
 CHUNK = 16_384  # points at a time, so that the scratch arrays stay in the processor's cache
 
 

@@ -56,9 +56,7 @@ class Grid:
             raise ValueError(f"Grid: every axis needs at least one node, not shape {self.shape}")
 
     @classmethod
-    def covering(
-        cls, lower: Sequence[float], upper: Sequence[float], spacing: float | Sequence[float]
-    ) -> Grid:
+    def covering(cls, lower: Sequence[float], upper: Sequence[float], spacing: float | Sequence[float]) -> Grid:
         """The smallest grid of this spacing (m) from `lower` that reaches `upper` (D numbers each, m)."""
         steps = (spacing,) * len(lower) if isinstance(spacing, (int, float)) else tuple(spacing)
         if not all(step > 0 for step in steps):
@@ -66,10 +64,7 @@ class Grid:
         if not all(end >= start for start, end in zip(lower, upper, strict=True)):
             raise ValueError(f"Grid.covering: upper {tuple(upper)} lies below lower {tuple(lower)}")
         # The slack keeps 10 mm / 1 mm at 10 cells although the quotient may round to 10.000000000000002.
-        cells = [
-            math.ceil((end - start) / step - 1e-9)
-            for start, end, step in zip(lower, upper, steps, strict=True)
-        ]
+        cells = [math.ceil((end - start) / step - 1e-9) for start, end, step in zip(lower, upper, steps, strict=True)]
         return cls(tuple(lower), steps, tuple(max(count, 0) + 1 for count in reversed(cells)))
 
     @property
@@ -101,9 +96,7 @@ class Grid:
         steps = torch.arange(count, dtype=torch.float64, device=device)
         return (self.origin[number] + self.spacing[number] * steps).to(dtype)
 
-    def nodes(
-        self, *, dtype: torch.dtype = torch.float64, device: torch.device | str | None = None
-    ) -> Tensor:
+    def nodes(self, *, dtype: torch.dtype = torch.float64, device: torch.device | str | None = None) -> Tensor:
         """All nodes as points `(size, D)`, m, in the order of a flattened grid array (x fastest)."""
         axes = [self.axis(number, dtype=dtype, device=device) for number in range(self.dimension)]
         mesh = torch.meshgrid(*reversed(axes), indexing="ij")
@@ -165,9 +158,7 @@ class Grid:
         lead = tuple(values.shape[:-1])
         stencil = points if isinstance(points, Stencil) else self.stencil(points, outside=outside)
         if values.ndim == 0 or values.shape[-1] != stencil.index.shape[-2]:
-            raise ValueError(
-                f"Grid.spread: {tuple(values.shape)} values for {stencil.index.shape[-2]} points"
-            )
+            raise ValueError(f"Grid.spread: {tuple(values.shape)} values for {stencil.index.shape[-2]} points")
         batch, count, index, weight = self._flat(stencil, lead)
         rows = values.reshape(batch, -1, count).transpose(1, 2).reshape(batch * count, -1)
         total = values.new_zeros(batch * self.size, rows.shape[1])
@@ -223,7 +214,5 @@ class Grid:
 
     def _lead(self, field: Tensor) -> tuple[int, ...]:
         if tuple(field.shape[field.ndim - self.dimension :]) != self.shape or field.ndim < self.dimension:
-            raise ValueError(
-                f"Grid.sample: the field's last axes must be {self.shape}, not {tuple(field.shape)}"
-            )
+            raise ValueError(f"Grid.sample: the field's last axes must be {self.shape}, not {tuple(field.shape)}")
         return tuple(field.shape[: field.ndim - self.dimension])

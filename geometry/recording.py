@@ -68,9 +68,7 @@ class Wall:
     def select(self, frames: slice | Sequence[int] | np.ndarray) -> Wall:
         """The wall at some of the frames."""
         vertices = self.vertices[frames] if self.moves else self.vertices
-        return replace(
-            self, vertices=vertices, velocity=None if self.velocity is None else self.velocity[frames]
-        )
+        return replace(self, vertices=vertices, velocity=None if self.velocity is None else self.velocity[frames])
 
 
 @dataclass(frozen=True, eq=False)

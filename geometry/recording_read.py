@@ -77,9 +77,7 @@ def _read(file: h5py.File, source: str) -> Recording:
 
 def _header(file: h5py.File, source: str) -> int:
     if _text(file, "format") != "recording":
-        raise RecordingError(
-            source, "attribute format", f'must be "recording", not {_text(file, "format")!r}'
-        )
+        raise RecordingError(source, "attribute format", f'must be "recording", not {_text(file, "format")!r}')
     version = _number(file, "format_version", source)
     if version != 1:
         rule = f"must be 1, the version this reader knows, not {version:g}"
@@ -161,15 +159,11 @@ def _load(node: h5py.Group | h5py.Dataset, dataset: str, kind: type, source: str
     settings = node.id.get_create_plist()
     for code, _, _, name in (settings.get_filter(number) for number in range(settings.get_nfilters())):
         if code not in FILTERS:
-            raise RecordingError(
-                source, dataset, f"is stored through {name!r}; use gzip, lzf or no compression"
-            )
+            raise RecordingError(source, dataset, f"is stored through {name!r}; use gzip, lzf or no compression")
     values = np.asarray(node[()])
     if kind in (np.bool_, np.int32, np.uint8, np.int64):
         _check_integers(values, dataset, kind, source)
-    with np.errstate(
-        over="ignore"
-    ):  # a float64 too large for float32 becomes inf, which the rules then report
+    with np.errstate(over="ignore"):  # a float64 too large for float32 becomes inf, which the rules then report
         return values.astype(kind)
 
 

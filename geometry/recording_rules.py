@@ -52,9 +52,7 @@ def check_shapes(recording: Recording, source: str = "recording") -> None:
     """Ranks and sizes that must agree: time, grid, wall and valves against each other."""
     arrays = recording.arrays()
     if recording.time.ndim != 1 or recording.time.size == 0:
-        raise RecordingError(
-            source, "/time", f"must be (T,) with at least one frame, not {recording.time.shape}"
-        )
+        raise RecordingError(source, "/time", f"must be (T,) with at least one frame, not {recording.time.shape}")
     for dataset, shapes in allowed_shapes(recording).items():
         if dataset in arrays and arrays[dataset].shape not in shapes:
             wanted = " or ".join(str(shape) for shape in shapes)
@@ -95,15 +93,11 @@ def measured_nodes(recording: Recording) -> np.ndarray:
 
 def _constants(recording: Recording, source: str) -> None:
     if not (np.isfinite(recording.rho) and recording.rho > 0):
-        raise RecordingError(
-            source, "attribute rho", f"must be a positive density in kg/m^3, not {recording.rho}"
-        )
+        raise RecordingError(source, "attribute rho", f"must be a positive density in kg/m^3, not {recording.rho}")
     for name, unit in (("mu", "Pa s"), ("period", "s; 0 = not periodic")):
         value = getattr(recording, name)
         if not (np.isfinite(value) and value >= 0):
-            raise RecordingError(
-                source, f"attribute {name}", f"must be finite and not negative ({unit}), not {value}"
-            )
+            raise RecordingError(source, f"attribute {name}", f"must be finite and not negative ({unit}), not {value}")
 
 
 def _time(recording: Recording, source: str) -> None:
@@ -113,9 +107,7 @@ def _time(recording: Recording, source: str) -> None:
     falling = np.diff(time) <= 0
     if falling.any():
         frame = int(np.argmax(falling))
-        rule = (
-            f"must increase strictly, but frame {frame} at {time[frame]:g} s precedes {time[frame + 1]:g} s"
-        )
+        rule = f"must increase strictly, but frame {frame} at {time[frame]:g} s precedes {time[frame + 1]:g} s"
         raise RecordingError(source, "/time", f"{rule}; sort the frames and drop repeated ones")
 
 
@@ -137,9 +129,7 @@ def _finite(recording: Recording, source: str) -> None:
         finite = np.isfinite(field) if dataset == "/pressure" else np.isfinite(field).all(axis=components)
         bad = measured & ~finite
         if bad.any():
-            rule = (
-                f"must be finite inside the mask, but is not at {int(bad.sum())} nodes, as at {_first(bad)}"
-            )
+            rule = f"must be finite inside the mask, but is not at {int(bad.sum())} nodes, as at {_first(bad)}"
             raise RecordingError(source, dataset, f"{rule}; take them out of /mask or give them /weight 0")
 
 
@@ -208,9 +198,7 @@ def _valves(recording: Recording, source: str) -> None:
     intervals = recording.valve_intervals
     if intervals is not None:
         if not np.isfinite(intervals).all():
-            raise RecordingError(
-                source, "/valve/intervals", "must be finite: rows (region label, opens, closes)"
-            )
+            raise RecordingError(source, "/valve/intervals", "must be finite: rows (region label, opens, closes)")
         label = intervals[:, 0]
         if ((label != np.rint(label)) | (label < 1)).any():
             rule = f"its first column must hold region labels 1, 2, ..., not {label}"

@@ -37,9 +37,7 @@ def refined_motion(motion: WallMotion, spacing: float) -> WallMotion:
         np.stack([result.weights @ frame for frame in frames])
         for frames in (motion.vertices_at_keys, motion.rates_at_keys)
     )
-    return WallMotion(
-        motion.time, vertices, rates, result.surface.faces, result.surface.region, motion.period
-    )
+    return WallMotion(motion.time, vertices, rates, result.surface.faces, result.surface.region, motion.period)
 
 
 def refinement(surface: Surface, spacing: float) -> Refinement:
@@ -104,14 +102,10 @@ def _cut_faces(vertices: np.ndarray, faces: np.ndarray, middle: np.ndarray) -> t
     other = np.linalg.norm(_at(vertices, f, m, 1) - vertices[f[:, 0]], axis=1)
     first = (one < other)[:, None]
     parts.append(
-        np.where(
-            first, np.column_stack([f[:, 0], m[:, 0], f[:, 2]]), np.column_stack([f[:, 0], m[:, 0], m[:, 1]])
-        )
+        np.where(first, np.column_stack([f[:, 0], m[:, 0], f[:, 2]]), np.column_stack([f[:, 0], m[:, 0], m[:, 1]]))
     )
     parts.append(
-        np.where(
-            first, np.column_stack([m[:, 0], m[:, 1], f[:, 2]]), np.column_stack([f[:, 0], m[:, 1], f[:, 2]])
-        )
+        np.where(first, np.column_stack([m[:, 0], m[:, 1], f[:, 2]]), np.column_stack([f[:, 0], m[:, 1], f[:, 2]]))
     )
     source += [rows] * 3
 

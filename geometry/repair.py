@@ -34,9 +34,7 @@ def repaired(surface: Surface, *, merge: float | None = None, hole_region: int =
         result.check()
     except SurfaceError as fault:
         text = str(fault).split(";")[0]
-        raise SurfaceError(
-            f"the surface cannot be mended: {text}; cut it where sheets cross or branch"
-        ) from fault
+        raise SurfaceError(f"the surface cannot be mended: {text}; cut it where sheets cross or branch") from fault
     return result
 
 

@@ -79,9 +79,7 @@ def surface_from_velocity(
     velocity = np.asarray(velocity, np.float64)
     speed = np.sqrt((velocity**2).sum(axis=-1 - grid.dimension))
     if speed.shape[-grid.dimension :] != grid.shape or speed.ndim > grid.dimension + 1:
-        raise SurfaceError(
-            f"surface_from_velocity: the velocity {velocity.shape} does not fit the grid {grid.shape}"
-        )
+        raise SurfaceError(f"surface_from_velocity: the velocity {velocity.shape} does not fit the grid {grid.shape}")
     moving = speed > threshold
     mask = moving.any(axis=0) if moving.ndim > grid.dimension else moving
     return surface_from_mask(mask, grid, alpha=alpha, smoothing=smoothing)
@@ -90,11 +88,7 @@ def surface_from_velocity(
 def taubin(surface: Surface, passes: int, *, shrink: float = 0.5, inflate: float = 0.53) -> Surface:
     """Taubin 1995, "A signal processing approach to fair surface design": smooth, then inflate, each pass."""
     count = len(surface.vertices)
-    pairs = (
-        surface.faces[:, [0, 1]]
-        if surface.dimension == 2
-        else surface.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
-    )
+    pairs = surface.faces[:, [0, 1]] if surface.dimension == 2 else surface.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
     graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(count, count)).tocsr()
     graph = ((graph + graph.T) > 0).astype(np.float64)
     degree = np.maximum(graph.sum(axis=1), 1)[:, None]

@@ -13,9 +13,7 @@ import numpy as np
 from .surface import Surface, SurfaceError
 
 
-def ellipsoid(
-    semi_axes: Sequence[float], spacing: float, centre: Sequence[float] = (0.0, 0.0, 0.0)
-) -> Surface:
+def ellipsoid(semi_axes: Sequence[float], spacing: float, centre: Sequence[float] = (0.0, 0.0, 0.0)) -> Surface:
     """An ellipsoid, semi-axes (m) along x, y, z, around `centre`; `spacing` (m) between its vertices."""
     axes = _positive("ellipsoid: semi_axes", semi_axes, 3)
     _positive("ellipsoid: spacing", [spacing], 1)
@@ -107,9 +105,7 @@ def revolved(profile: np.ndarray, spacing: float, region: np.ndarray | int = 0) 
     rings = [ring_of(radius, z, spacing) for radius, z in profile[1:-1]]
     rings = [np.array([[0, 0, profile[0, 1]]]), *rings, np.array([[0, 0, profile[-1, 1]]])]
     first = np.concatenate([[0], np.cumsum([len(ring) for ring in rings])])
-    bands = [
-        stitched(first[k], len(rings[k]), first[k + 1], len(rings[k + 1])) for k in range(len(rings) - 1)
-    ]
+    bands = [stitched(first[k], len(rings[k]), first[k + 1], len(rings[k + 1])) for k in range(len(rings) - 1)]
     labels = np.repeat(np.broadcast_to(region, len(bands)), [len(band) for band in bands])
     surface = Surface(np.concatenate(rings), np.concatenate(bands), labels)
     return surface if surface.volume > 0 else Surface(surface.vertices, surface.faces[:, ::-1], labels)

@@ -41,21 +41,13 @@ class Surface:
     def __post_init__(self) -> None:
         vertices = np.ascontiguousarray(self.vertices, dtype=np.float64)
         faces = np.ascontiguousarray(self.faces, dtype=np.int32)
-        region = (
-            np.zeros(len(faces), np.uint8)
-            if self.region is None
-            else np.ascontiguousarray(self.region, np.uint8)
-        )
+        region = np.zeros(len(faces), np.uint8) if self.region is None else np.ascontiguousarray(self.region, np.uint8)
         if vertices.ndim != 2 or vertices.shape[1] not in (2, 3):
             raise SurfaceError(f"vertices must be (nv, 2) or (nv, 3), not {vertices.shape}")
         if faces.ndim != 2 or faces.shape[1] != vertices.shape[1] or len(faces) == 0:
-            raise SurfaceError(
-                f"faces must be (nf, {vertices.shape[1]}) with at least one face, not {faces.shape}"
-            )
+            raise SurfaceError(f"faces must be (nf, {vertices.shape[1]}) with at least one face, not {faces.shape}")
         if region.shape != (len(faces),):
-            raise SurfaceError(
-                f"region must hold one label for each of the {len(faces)} faces, not {region.shape}"
-            )
+            raise SurfaceError(f"region must hold one label for each of the {len(faces)} faces, not {region.shape}")
         if not np.isfinite(vertices).all():
             raise SurfaceError("vertices must be finite (metres)")
         if faces.min() < 0 or faces.max() >= len(vertices):
@@ -196,9 +188,7 @@ class Surface:
 
         if self.dimension != 3:
             raise SurfaceError("a polyline has no trimesh form: it is two-dimensional")
-        return trimesh.Trimesh(
-            self.vertices, self.faces, face_attributes={"region": self.region}, process=False
-        )
+        return trimesh.Trimesh(self.vertices, self.faces, face_attributes={"region": self.region}, process=False)
 
     def _volume_shares(self) -> np.ndarray:
         """Volume of the cone over each face, `(nf,)`, from a common tip."""

@@ -31,9 +31,7 @@ def read_surface(path: str | Path, *, scale: float = 1.0, mend: bool = True) -> 
     if not path.is_file():
         raise FileNotFoundError(f"{path}: there is no such file")
     if path.suffix.lower() not in SUFFIXES:
-        raise SurfaceError(
-            f"{path}: surfaces are read from {', '.join(SUFFIXES)}, not from {path.suffix or 'this'}"
-        )
+        raise SurfaceError(f"{path}: surfaces are read from {', '.join(SUFFIXES)}, not from {path.suffix or 'this'}")
     if not scale > 0:
         raise SurfaceError(f"{path}: scale must be positive (metres per unit of the file), not {scale}")
     mesh = _load(path)
@@ -42,9 +40,7 @@ def read_surface(path: str | Path, *, scale: float = 1.0, mend: bool = True) -> 
         lower, upper = surface.bounds
         if (upper - lower).max() > LARGEST:
             size = (upper - lower).max()
-            raise SurfaceError(
-                f"is {size:g} m large, so it is probably in mm or cm: pass scale=1e-3 or scale=1e-2"
-            )
+            raise SurfaceError(f"is {size:g} m large, so it is probably in mm or cm: pass scale=1e-3 or scale=1e-2")
         return repaired(surface) if mend else surface
     except SurfaceError as fault:
         raise SurfaceError(f"{path}: {fault}") from fault
@@ -54,9 +50,7 @@ def write_surface(path: str | Path, surface: Surface, *, scale: float = 1.0) -> 
     """Write a 3-D surface as STL, OBJ or PLY by suffix, in units of `scale` (m); PLY keeps the regions."""
     path = Path(path)
     if path.suffix.lower() not in SUFFIXES:
-        raise SurfaceError(
-            f"{path}: surfaces are written to {', '.join(SUFFIXES)}, not to {path.suffix or 'this'}"
-        )
+        raise SurfaceError(f"{path}: surfaces are written to {', '.join(SUFFIXES)}, not to {path.suffix or 'this'}")
     mesh = surface.trimesh()
     mesh.vertices = mesh.vertices / scale
     mesh.export(path, file_type=path.suffix.lower()[1:])

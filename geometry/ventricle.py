@@ -131,9 +131,7 @@ class Ventricle:
     def scale_rates(self, t: float) -> np.ndarray:
         """d/dt of `scales`, `(3,)`, 1/s."""
         k = self.axial_share
-        return (
-            self.scales(t) * np.array([(1 - k) / 2, (1 - k) / 2, k]) * self.beat.rate(t) / self.beat.volume(t)
-        )
+        return self.scales(t) * np.array([(1 - k) / 2, (1 - k) / 2, k]) * self.beat.rate(t) / self.beat.volume(t)
 
     def wall_velocity(self, points: np.ndarray, t: float) -> np.ndarray:
         """The affine wall motion's velocity (m/s) at points `(n, 3)` of the wall at time `t`."""
@@ -201,9 +199,7 @@ class Ventricle:
             period=self.beat.period if periodic else 0.0,
             description="parametric ventricle: truncated prolate spheroid, affine motion, fixed base z = 0",
             valve_intervals=np.array([(1, *self.beat.filling), (2, *self.beat.ejection)]),
-            valve_open=np.stack(
-                [self._open(time, self.beat.filling), self._open(time, self.beat.ejection)], axis=1
-            ),
+            valve_open=np.stack([self._open(time, self.beat.filling), self._open(time, self.beat.ejection)], axis=1),
             volume=[self.volume(t) for t in time],
             flux_mitral=[max(self.volume_rate(t), 0.0) for t in time],
             flux_aortic=[min(self.volume_rate(t), 0.0) for t in time],

@@ -17,15 +17,11 @@ if TYPE_CHECKING:
 def ventricle_surface(shape: Ventricle, spacing: float) -> Surface:
     """The end-diastolic surface, vertices about `spacing` (m) apart; SurfaceError if that is too coarse."""
     if not 0 < spacing <= 0.5 * shape.base_radius:
-        raise SurfaceError(
-            f"ventricle: spacing must be positive and below half the base radius, not {spacing} m"
-        )
+        raise SurfaceError(f"ventricle: spacing must be positive and below half the base radius, not {spacing} m")
     rings = _side(shape, spacing)
     base, base_faces, base_region = _base(shape, rings[0], spacing)
     first = np.concatenate([[0], np.cumsum([len(ring) for ring in rings])])
-    bands = [
-        stitched(first[k], len(rings[k]), first[k + 1], len(rings[k + 1])) for k in range(len(rings) - 1)
-    ]
+    bands = [stitched(first[k], len(rings[k]), first[k + 1], len(rings[k + 1])) for k in range(len(rings) - 1)]
     side = np.concatenate(bands)
     # The base numbers the top ring first, as here, and its own points after it: these come after all rings.
     top = len(rings[0])
@@ -44,8 +40,7 @@ def _side(shape: Ventricle, spacing: float) -> list[np.ndarray]:
     count = max(4, round(length[-1] / spacing))
     even = np.interp(np.linspace(0, length[-1], count + 1), length, angle)
     rings = [
-        ring_of(shape.semi_minor * np.sin(a), shape.semi_major * np.cos(a) - shape.offset, spacing)
-        for a in even[1:-1]
+        ring_of(shape.semi_minor * np.sin(a), shape.semi_major * np.cos(a) - shape.offset, spacing) for a in even[1:-1]
     ]
     return [ring_of(shape.base_radius, 0.0, spacing), *rings, np.array([[0.0, 0.0, -shape.length]])]
 
@@ -55,9 +50,7 @@ def _base(shape: Ventricle, top: np.ndarray, spacing: float) -> tuple[np.ndarray
     mitral, aortic = (np.asarray(c) for c in (shape.mitral_centre, shape.aortic_centre))
     circle = (shape.aortic_radius, shape.aortic_radius)
     fine = [np.concatenate([rim, top[:, :2]]) for rim in shape.rims(256)]
-    gap = min(
-        cKDTree(fine[0]).query(shape.rims(256)[1])[0].min(), cKDTree(top[:, :2]).query(fine[1][:256])[0].min()
-    )
+    gap = min(cKDTree(fine[0]).query(shape.rims(256)[1])[0].min(), cKDTree(top[:, :2]).query(fine[1][:256])[0].min())
     # A rim edge longer than twice the gap to the next rim would not be a Delaunay edge.
     step = min(spacing, 1.5 * float(gap))
     rims = [mitral + ellipse_rim(shape.mitral_semi_axes, step), aortic + ellipse_rim(circle, step)]
@@ -82,9 +75,7 @@ def _keep_rims(faces: np.ndarray, counts: list[int]) -> None:
     for count in counts:
         for k in range(count):
             if tuple(sorted((start + k, start + (k + 1) % count))) not in edges:
-                raise SurfaceError(
-                    "ventricle: the spacing is too coarse to keep the rims of the orifices; refine it"
-                )
+                raise SurfaceError("ventricle: the spacing is too coarse to keep the rims of the orifices; refine it")
         start += count
 
 

@@ -55,9 +55,7 @@ def grid_winding(grid: Grid, vertices: np.ndarray, faces: np.ndarray) -> np.ndar
         np.asarray(grid.origin[:-1])
         + 1e-7 * np.asarray(grid.spacing[:-1]) * np.array([0.8191, 0.5736])[: dimension - 1]
     )
-    place = (vertices[:, :-1] - lateral) / np.asarray(
-        grid.spacing[:-1]
-    )  # in lines; line (i, j) is at the integers
+    place = (vertices[:, :-1] - lateral) / np.asarray(grid.spacing[:-1])  # in lines; line (i, j) is at the integers
     crossing = _segment_crossings if dimension == 2 else _triangle_crossings
     counts = tuple(reversed(grid.shape[1:]))
     line, height, sign = crossing(place, vertices[:, -1], faces, counts)
@@ -92,9 +90,7 @@ def _triangle_crossings(place, height, faces, counts):
     row, i = _ranges(lower[strip, 0], upper[strip, 0])
     triangle, j = strip[row], j[row]
     at = np.stack([i, j], axis=-1).astype(np.float64)
-    weight = np.stack(
-        [_edge(place, faces[triangle, (k + 1) % 3], faces[triangle, (k + 2) % 3], at) for k in range(3)]
-    )
+    weight = np.stack([_edge(place, faces[triangle, (k + 1) % 3], faces[triangle, (k + 2) % 3], at) for k in range(3)])
     positive = (weight > 0).sum(0)
     pierced = (positive == 3) | (positive == 0)
     weight, triangle = weight[:, pierced], triangle[pierced]

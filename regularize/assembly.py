@@ -101,9 +101,7 @@ class _CellGroups:
         values = self.block.rows_at(rows).double()
         weight = self.block.weight[rows].double()
         if not isinstance(self.block, VectorRows):
-            values = (values * (valid * weight)[:, None, None]).view(
-                len(total), -1, self.size * self.components
-            )
+            values = (values * (valid * weight)[:, None, None]).view(len(total), -1, self.size * self.components)
             total += torch.bmm(values.mT, values).view_as(total)
             return
         values = values.view(len(total), -1, self.size)

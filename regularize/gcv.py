@@ -38,9 +38,7 @@ def cross_validate(search: LikelihoodSearch, no_slip: float | None, rounds: int)
     return Choice(noise, length, no_slip, None, search.groups.order, search.factor, count, settled)
 
 
-def _evaluate(
-    search: LikelihoodSearch, curvature: float, no_slip: float | None
-) -> tuple[float, float, torch.Tensor]:
+def _evaluate(search: LikelihoodSearch, curvature: float, no_slip: float | None) -> tuple[float, float, torch.Tensor]:
     """Score, noise variance and coefficients at one curvature length."""
     one = torch.ones(search.components, dtype=torch.float64)
     scale = search.scale(one)

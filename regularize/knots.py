@@ -42,9 +42,7 @@ class Knots:
         if min(spacing) <= 0:
             raise InvalidInput(f"spacing is {tuple(spacing)}: knot distances must be positive")
         # The small slack keeps a box of exactly k intervals from getting k + 1 of them by round-off.
-        cells = tuple(
-            max(1, _ceil((b - a) / h - 1e-9)) for a, b, h in zip(lower, upper, spacing, strict=True)
-        )
+        cells = tuple(max(1, _ceil((b - a) / h - 1e-9)) for a, b, h in zip(lower, upper, spacing, strict=True))
         origin = tuple((a + b - n * h) / 2 for a, b, h, n in zip(lower, upper, spacing, cells, strict=True))
         return cls(origin, tuple(float(h) for h in spacing), cells, degree)
 

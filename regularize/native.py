@@ -170,9 +170,7 @@ class PackedSystem:
                 self.lib.spline_gradient(ctypes.byref(self.grid), ctypes.byref(rows), *given)
         return out if x is None else out - self.system.damping**2 * x
 
-    def _subtract_cells(
-        self, block: CellRows, slots: torch.Tensor, x: torch.Tensor, out: torch.Tensor
-    ) -> None:
+    def _subtract_cells(self, block: CellRows, slots: torch.Tensor, x: torch.Tensor, out: torch.Tensor) -> None:
         near = self.ordering.position[slots]
         gram = cell_gram(block)[self.ordering.local()][:, :, self.ordering.local()]
         pulled = x[near].flatten(1) @ gram.flatten(0, 1).flatten(1, 2)

@@ -50,9 +50,7 @@ class _PointRows:
 class VectorRows(_PointRows):
     """Rows w_ik v_k(x_i) = w_ik target_ik, one per point and component (the matrix S of thesis eq. 3.7)."""
 
-    def __init__(
-        self, knots: Knots, points: torch.Tensor, target: torch.Tensor, weight: torch.Tensor
-    ) -> None:
+    def __init__(self, knots: Knots, points: torch.Tensor, target: torch.Tensor, weight: torch.Tensor) -> None:
         super().__init__(knots, points, target.shape[1])
         self.weight = weight.expand(target.shape)
         self.target = (self.weight * target).flatten()

@@ -35,9 +35,7 @@ class Problem:
         posterior = None
         if factor is not None and own_factor:
             posterior = self.posterior(solution, factor)
-        return SplineField(
-            knots, coefficients, covered, solution, data.left_out, self.choice, posterior, factor
-        )
+        return SplineField(knots, coefficients, covered, solution, data.left_out, self.choice, posterior, factor)
 
     def posterior(self, solution: Solution, factor: Factor | BlockFactor) -> Posterior:
         """The posterior, with what the samples' errors are found to have in common."""

@@ -51,11 +51,7 @@ def _knots_of_counts(data: FitData, nodes: tuple[int, ...], sides: list[float], 
 
 def build_system(options: "Smoother", knots: Knots, data: FitData) -> System:
     """The rows of thesis eq. 3.22 (plus no-slip and curvature) with the options' scaling."""
-    return (
-        _thesis_system(options, knots, data)
-        if options.scaling == "thesis"
-        else _density(options, knots, data)
-    )
+    return _thesis_system(options, knots, data) if options.scaling == "thesis" else _density(options, knots, data)
 
 
 def _thesis_system(options: "Smoother", knots: Knots, data: FitData) -> System:
@@ -127,9 +123,7 @@ def wall_roots(wall: WallRows) -> torch.Tensor:
     return (wall.weight / wall.weight.sum()).sqrt()
 
 
-def _wall_blocks(
-    knots: Knots, wall: WallRows, normal: float | None, no_slip: float | None, root: torch.Tensor
-) -> list:
+def _wall_blocks(knots: Knots, wall: WallRows, normal: float | None, no_slip: float | None, root: torch.Tensor) -> list:
     """Normal rows at every wall point, full-vector rows where the wall holds the blood."""
     blocks = []
     if normal:
@@ -137,7 +131,5 @@ def _wall_blocks(
         blocks.append(DirectionRows(knots, wall.points, wall.normals, target, normal * root))
     held = wall.no_slip
     if no_slip and bool(held.any()):
-        blocks.append(
-            VectorRows(knots, wall.points[held], wall.velocity[held], (no_slip * root[held])[:, None])
-        )
+        blocks.append(VectorRows(knots, wall.points[held], wall.velocity[held], (no_slip * root[held])[:, None]))
     return blocks

@@ -142,9 +142,7 @@ def _checked_samples(
         raise InvalidInput("no sample has a positive weight: there is nothing to fit")
     points, velocity, weight = points[keep], velocity[keep], weight[keep]
     if not bool(torch.isfinite(points).all() and torch.isfinite(velocity).all()):
-        raise InvalidInput(
-            "points or velocity hold NaN or infinity at a positive weight: set its weight to 0"
-        )
+        raise InvalidInput("points or velocity hold NaN or infinity at a positive weight: set its weight to 0")
     return points, velocity, weight, None if beam is None else _checked_beam(beam, keep, velocity)
 
 
@@ -166,8 +164,7 @@ def _checked_box(
     lower, upper = (torch.as_tensor(side, dtype=points.dtype, device=points.device) for side in box)
     if lower.shape != points.shape[1:] or upper.shape != lower.shape or not bool((upper > lower).all()):
         raise InvalidInput(
-            f"box is {box}: expected (lower, upper) corners with {points.shape[1]} numbers each "
-            "and upper > lower"
+            f"box is {box}: expected (lower, upper) corners with {points.shape[1]} numbers each and upper > lower"
         )
     slack = 1e-6 * (upper - lower)
     outside = int((~((points >= lower - slack) & (points <= upper + slack)).all(1)).sum())

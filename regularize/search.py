@@ -45,8 +45,15 @@ def choose(options: "Smoother", knots: Knots, data: FitData) -> Choice | None:
         slip = VectorRows(coarse, wall.points[held], wall.velocity[held], wall_roots(wall)[held, None])
     factor = row_factor(smoothness_gram(options, coarse, data)) / data.extent(coarse) ** 0.5
     groups = Groups(
-        options.order, data.points, data.velocity, data.weight, CellRows(coarse, cells, factor, 1), slip,
-        chosen[0] if chosen else None, [block for block in blocks if block not in chosen], damping,
+        options.order,
+        data.points,
+        data.velocity,
+        data.weight,
+        CellRows(coarse, cells, factor, 1),
+        slip,
+        chosen[0] if chosen else None,
+        [block for block in blocks if block not in chosen],
+        damping,
     )
     search = LikelihoodSearch(coarse, groups, options.robust)
     with torch.no_grad():

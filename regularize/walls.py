@@ -35,21 +35,15 @@ class WallRows:
             value = torch.as_tensor(getattr(self, name)).to(points)
             # points may carry the time as one more column than the vectors have
             if value.ndim != 2 or len(value) != len(points) or points.shape[1] - value.shape[1] not in (0, 1):
-                raise InvalidInput(
-                    f"wall {name} have shape {tuple(value.shape)}: expected {tuple(points.shape)}"
-                )
+                raise InvalidInput(f"wall {name} have shape {tuple(value.shape)}: expected {tuple(points.shape)}")
             convert[name] = value
         count = points.shape[:1]
-        weight = (
-            torch.ones_like(points[:, 0]) if self.weight is None else torch.as_tensor(self.weight).to(points)
-        )
+        weight = torch.ones_like(points[:, 0]) if self.weight is None else torch.as_tensor(self.weight).to(points)
         slip = torch.ones(count, dtype=torch.bool) if self.no_slip is None else torch.as_tensor(self.no_slip)
         convert["weight"], convert["no_slip"] = weight, slip.bool().to(points.device)
         for name in ("weight", "no_slip"):
             if convert[name].shape != count:
-                raise InvalidInput(
-                    f"wall {name} has shape {tuple(convert[name].shape)}: expected {tuple(count)}"
-                )
+                raise InvalidInput(f"wall {name} has shape {tuple(convert[name].shape)}: expected {tuple(count)}")
         for name in ("points", "normals", "velocity", "weight"):
             if not bool(torch.isfinite(convert[name]).all()):
                 raise InvalidInput(f"wall {name} contain NaN or infinity: leave such rows out")

@@ -29,7 +29,5 @@ def blocks_of(axes, degree=3):
         ),
     }
     if degree > 1:
-        blocks["curvature"] = CellRows(
-            knots, cells, row_factor(curvature_gram(knots, range(axes))), components
-        )
+        blocks["curvature"] = CellRows(knots, cells, row_factor(curvature_gram(knots, range(axes))), components)
     return knots, blocks

@@ -28,9 +28,12 @@ def square(across):
 
 def started(walls, scheme, across=24, viscosity=0.0, no_slip=False, **changes):
     scene = Scene(
-        spacing=1 / across, fluid=Fluid(DENSITY, viscosity), walls=walls, reference_speed=1.0,
+        spacing=1 / across,
+        fluid=Fluid(DENSITY, viscosity),
+        walls=walls,
+        reference_speed=1.0,
         dimension=walls.dimension,
-    )  # fmt: skip
+    )
     scheme = preset(scheme, **({"wall": CompleteKernelWall(no_slip=no_slip)} | changes))
     return Simulator(scene, scheme, dtype=torch.float64).start(0.0)
 
@@ -110,9 +113,12 @@ def test_what_a_valve_carries_balances_what_walls_do():
 
     walls = moving(tube, squeezed, np.linspace(0, 1.25 * time, 21))
     scene = Scene(
-        spacing=spacing, fluid=Fluid(DENSITY, 0.0), walls=walls, valves=(Valve(end, ((0.0, 1.0),)),),
+        spacing=spacing,
+        fluid=Fluid(DENSITY, 0.0),
+        walls=walls,
+        valves=(Valve(end, ((0.0, 1.0),)),),
         reference_speed=0.6,
-    )  # fmt: skip
+    )
     scheme = preset("weakly_compressible", wall=CompleteKernelWall(no_slip=False), sound_speed=10.0)
     run = Simulator(scene, scheme).start(0.0)
     run.advance(time)

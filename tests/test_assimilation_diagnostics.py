@@ -176,9 +176,7 @@ def test_a_dead_ensemble_is_an_error():
 def test_figure_shows_what_the_record_holds(tmp_path):
     figure = filter_figure(cycles(10.0).summary())
     assert "overconfident" in figure.get_suptitle()
-    labels = [
-        text.get_text() for axes in figure.axes if axes.get_legend() for text in axes.get_legend().texts
-    ]
+    labels = [text.get_text() for axes in figure.axes if axes.get_legend() for text in axes.get_legend().texts]
     assert {"error, forecast", "jet", "missing", "used"} <= set(labels)
     bars = figure.axes[1].patches
     assert sum(bar.get_height() for bar in bars) == pytest.approx(1) and len(bars) == 31

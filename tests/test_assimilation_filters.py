@@ -57,9 +57,7 @@ def test_subspace_update_is_the_kalman_filter():
     updated = subspace.update(
         subspace.modes @ operator.T, observations.value - operator @ subspace.mean, 1 / observations.variance
     )
-    mean, covariance = kalman(
-        subspace.mean, subspace.covariance(), operator, observations.value, observations.variance
-    )
+    mean, covariance = kalman(subspace.mean, subspace.covariance(), operator, observations.value, observations.variance)
     assert torch.allclose(updated.mean, mean, atol=1e-11)
     assert torch.allclose(updated.covariance(), covariance, atol=1e-11)
     assert torch.allclose(updated.variance(), covariance.diagonal(), atol=1e-11)
@@ -129,9 +127,7 @@ def test_etkf_has_the_symmetric_square_root():
     inverse = 5 * torch.eye(6, dtype=torch.float64) + (observed / observations.variance) @ observed.T
     value, vector = torch.linalg.eigh(torch.linalg.inv(inverse))
     root = (vector * (5 * value).sqrt()) @ vector.T
-    shift = torch.linalg.solve(
-        inverse, observed @ ((observations.value - operator @ mean) / observations.variance)
-    )
+    shift = torch.linalg.solve(inverse, observed @ ((observations.value - operator @ mean) / observations.variance))
     expected = mean + (root + shift) @ (ensemble - mean)
     analysis = ETKF().analyse(ensemble, ensemble @ operator.T, observations)
     assert torch.allclose(analysis.ensemble, expected, atol=1e-12)

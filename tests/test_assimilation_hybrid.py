@@ -36,9 +36,7 @@ def test_hybrid_mean_and_perturbations():
     assert torch.allclose(analysis.ensemble.mean(0), expected, atol=1e-13)
     assert torch.allclose(analysis.ensemble - expected, alone.ensemble - alone.mean, atol=1e-13)
     later = HybridGain(filter=ETKF(), second=lambda mean, _: mean + 1, weight=0.25, sequential=True)
-    assert torch.allclose(
-        later.analyse(ensemble, ensemble @ operator.T, seen).mean, alone.mean + 0.25, atol=1e-13
-    )
+    assert torch.allclose(later.analyse(ensemble, ensemble @ operator.T, seen).mean, alone.mean + 0.25, atol=1e-13)
 
 
 def test_second_analysis_hears_of_rejections_but_not_of_localisation():

@@ -163,9 +163,7 @@ def test_float32_sums_are_given_up_for_very_precise_observations():
     exact = Observations(observations.value, observations.variance * 1e-9, observations.position)
     letkf = LETKF(localisation=Localisation(2.5), patch=None)
     single = letkf.analyse(ensemble.float(), predicted.float(), exact, state_positions=place)
-    double = letkf.analyse(
-        ensemble.float().double(), predicted.float().double(), exact, state_positions=place
-    )
+    double = letkf.analyse(ensemble.float().double(), predicted.float().double(), exact, state_positions=place)
     assert torch.allclose(single.ensemble.double(), double.ensemble, atol=1e-3)
 
 

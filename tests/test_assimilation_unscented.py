@@ -103,9 +103,7 @@ def test_reduced_unscented_is_the_kalman_filter_in_its_subspace(rule):
         value = double(3, seed=100 + cycle)
         mean, covariance = kalman_step(mean, covariance, model, none, operator, value, variance)
         points = points @ model.T
-        analysis = ReducedUnscented(points=rule).analyse(
-            points, points @ operator.T, Observations(value, variance)
-        )
+        analysis = ReducedUnscented(points=rule).analyse(points, points @ operator.T, Observations(value, variance))
         points = analysis.ensemble
         assert torch.allclose(analysis.mean, mean, atol=1e-10, rtol=0)
         assert torch.allclose(rule.gather(points).covariance(), covariance, atol=1e-10, rtol=0)
@@ -120,9 +118,7 @@ def test_reduced_unscented_keeps_the_variance_of_the_even_response():
     silent = Observations(torch.full((5,), torch.nan).double(), torch.ones(5).double())
     full = rule.gather(points).variance().sum()
     kept = ReducedUnscented(points=rule).analyse(points, points, silent).variance.sum()
-    dropped = (
-        ReducedUnscented(points=rule, keep_variance=False).analyse(points, points, silent).variance.sum()
-    )
+    dropped = ReducedUnscented(points=rule, keep_variance=False).analyse(points, points, silent).variance.sum()
     assert kept.item() == pytest.approx(full.item(), rel=1e-12)
     assert dropped < 0.99 * full
 
@@ -206,9 +202,7 @@ def test_missing_observations_and_gross_errors():
     value = operator @ state.mean + torch.tensor([0.1, 1e4, torch.nan]).double()
     filter_ = UnscentedFilter(gross_error=5.0)
     update = filter_.update(state, lambda x: x @ operator.T, Observations(value, torch.ones(3).double()))
-    alone = filter_.update(
-        state, lambda x: x @ operator[:1].T, Observations(value[:1], torch.ones(1).double())
-    )
+    alone = filter_.update(state, lambda x: x @ operator[:1].T, Observations(value[:1], torch.ones(1).double()))
     assert update.counts() == {"used": 1, "missing": 1, "gross_error": 1}
     assert torch.allclose(update.state.mean, alone.state.mean, atol=1e-12)
     assert torch.allclose(update.nis, alone.nis)

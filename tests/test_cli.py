@@ -28,9 +28,7 @@ def files(tmp_path_factory) -> dict[str, str]:
     truth = geometry.read_recording(data.sample_truth())
     recordings = {
         "measured": measured,
-        "truth": truth.select(
-            (truth.time > measured.time[0] - 1e-6) & (truth.time < measured.time[-1] + 1e-6)
-        ),
+        "truth": truth.select((truth.time > measured.time[0] - 1e-6) & (truth.time < measured.time[-1] + 1e-6)),
         "late_truth": truth.select(truth.time > measured.time[0] + 1e-6),
         "coarse_truth": coarser(truth),
     }
@@ -80,9 +78,19 @@ def assimilated(files, tmp_path_factory) -> tuple[Path, subprocess.CompletedProc
     folder = tmp_path_factory.mktemp("assimilate")
     methods = ",".join(pipeline.METHODS)
     done = torchsph(
-        "assimilate", files["measured"], "--truth", files["truth"], "--method", methods, *QUICK,
-        "--members", "3", "--out", "out", cwd=folder,
-    )  # fmt: skip
+        "assimilate",
+        files["measured"],
+        "--truth",
+        files["truth"],
+        "--method",
+        methods,
+        *QUICK,
+        "--members",
+        "3",
+        "--out",
+        "out",
+        cwd=folder,
+    )
     assert done.returncode == 0, done.stderr
     return folder / "out", done
 
@@ -116,9 +124,7 @@ def test_assimilate_reports_the_errors_of_the_files_it_wrote(assimilated, files)
     true = truth.velocity[::2]
     size = np.sqrt(np.mean(np.sum(true.astype(float) ** 2, 1)[measured.mask]))
     for name in document["methods"]:
-        velocity = (
-            measured.velocity if name == "raw" else geometry.read_recording(folder / f"{name}.h5").velocity
-        )
+        velocity = measured.velocity if name == "raw" else geometry.read_recording(folder / f"{name}.h5").velocity
         error = np.sqrt(np.mean(np.sum((velocity - true).astype(float) ** 2, 1)[measured.mask]))
         scores = document["methods"][name]
         assert set(scores) == set(metrics.METRICS)
@@ -151,9 +157,7 @@ def test_one_asked_method_becomes_the_analysis(files, tmp_path):
 
 
 def test_forecast(files, tmp_path):
-    done = torchsph(
-        "forecast", files["truth"], "--leads", "0.01,0.005", *QUICK, "--save", "--out", "out", cwd=tmp_path
-    )
+    done = torchsph("forecast", files["truth"], "--leads", "0.01,0.005", *QUICK, "--save", "--out", "out", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     names = {"metrics.json", "forecast.png", "forecast_5ms.h5", "forecast_10ms.h5"}
     assert {path.name for path in (tmp_path / "out").iterdir()} == names
@@ -189,9 +193,7 @@ def persistence(truth: geometry.Recording, ahead: int) -> float:
 
 
 def test_measure_then_smooth_then_info(files, tmp_path):
-    measured = torchsph(
-        "measure", files["truth"], "--out", "m.h5", "--every", "2", "--seed", "3", cwd=tmp_path
-    )
+    measured = torchsph("measure", files["truth"], "--out", "m.h5", "--every", "2", "--seed", "3", cwd=tmp_path)
     assert measured.returncode == 0, measured.stderr
     recording = geometry.read_recording(tmp_path / "m.h5")
     assert recording.frames == 3 and recording.weight is not None
@@ -206,9 +208,7 @@ def test_measure_then_smooth_then_info(files, tmp_path):
 def test_measure_repeats_itself_with_the_same_seed_alone(files, tmp_path):
     def velocity(seed: int) -> np.ndarray:
         out = str(tmp_path / f"{seed}.h5")
-        assert (
-            cli.main(["measure", files["truth"], "--out", out, "--seed", str(seed), "--lateral", "0.2"]) == 0
-        )
+        assert cli.main(["measure", files["truth"], "--out", out, "--seed", str(seed), "--lateral", "0.2"]) == 0
         return geometry.read_recording(out).velocity
 
     first, again, other = velocity(1), velocity(1), velocity(2)
@@ -295,9 +295,7 @@ def test_fault_in_a_process_of_its_own(tmp_path):
         (PermissionError(13, "Permission denied", "there"), 2, "there: Permission denied"),
     ],
 )
-def test_failure_of_the_computation_leaves_nothing_behind(
-    error, code, told, files, tmp_path, monkeypatch, capsys
-):
+def test_failure_of_the_computation_leaves_nothing_behind(error, code, told, files, tmp_path, monkeypatch, capsys):
     def fail(*_, **__):
         raise error
 

@@ -105,9 +105,10 @@ def test_later_frames_improve_earlier_analyses_alone(given, plain, tmp_path, mon
     np.testing.assert_array_equal(late.recording.velocity[-1], plain.recording.velocity[-1])
     assert late.info["filter"] == plain.info["filter"]
     inside = np.asarray(given.measured.mask, bool)[:-1]
-    moved, sure, known = (np.moveaxis(part[:-1], 1, -1)[inside] for part in (
-        late.recording.velocity - plain.recording.velocity, late.recording.sigma, plain.recording.sigma
-    ))  # fmt: skip
+    moved, sure, known = (
+        np.moveaxis(part[:-1], 1, -1)[inside]
+        for part in (late.recording.velocity - plain.recording.velocity, late.recording.sigma, plain.recording.sigma)
+    )
     assert 0 < np.square(moved).mean() < np.square(known).mean()
     assert np.square(sure).mean() < np.square(known).mean()
 
@@ -174,8 +175,10 @@ def test_ten_frames_without_data_are_forecast_and_their_uncertainty_grows():
     smoothed = smooth_frames(splines)
     run = assimilate(measured, made_model(measured), members=2, splines=splines, smoothed=smoothed, seed=1)
     assert run.info["coasted_frames"] == 10
-    assert any("no observation was used in this cycle" in words and "10 of 12" in words
-               for words in run.info["filter"]["warnings"])  # fmt: skip
+    assert any(
+        "no observation was used in this cycle" in words and "10 of 12" in words
+        for words in run.info["filter"]["warnings"]
+    )
     sigma = [float(np.square(run.recording.sigma[f]).mean()) ** 0.5 for f in range(measured.frames)]
     assert sigma[10] > 1.2 * sigma[1]
     # blind through the opening of the valve, it finds back in two analyses: measured .74 before and .45 after
@@ -265,11 +268,16 @@ def test_a_second_measurement_of_other_grid_and_times_helps(given):
     near = every.select((every.time > given.measured.time[0]) & (every.time < given.measured.time[-1] + 1e-6))
     grid = near.grid
     shape = tuple(len(range(0, n, 2)) for n in grid.shape)
-    thin = along_z(replace(
-        near, grid=geometry.Grid(grid.origin, tuple(2 * s for s in grid.spacing), shape),
-        velocity=near.velocity[..., ::2, ::2, ::2], mask=near.mask[:, ::2, ::2, ::2], pressure=None,
-        sigma=np.full((near.frames, 3, *shape), 0.01, np.float32),
-    ))  # fmt: skip
+    thin = along_z(
+        replace(
+            near,
+            grid=geometry.Grid(grid.origin, tuple(2 * s for s in grid.spacing), shape),
+            velocity=near.velocity[..., ::2, ::2, ::2],
+            mask=near.mask[:, ::2, ::2, ::2],
+            pressure=None,
+            sigma=np.full((near.frames, 3, *shape), 0.01, np.float32),
+        )
+    )
     both = assimilate(given.measured, fine, members=3, also=[thin], **known)
     used = both.info["filter"]["observations"]["used"]
     assert used > plain.info["filter"]["observations"]["used"] + 1000
@@ -277,8 +285,12 @@ def test_a_second_measurement_of_other_grid_and_times_helps(given):
     assert nrmse(both.recording) < 0.93 * nrmse(plain.recording)
     with pytest.raises(ValueError, match="dimensions"):
         flat = geometry.Recording(
-            time=near.time, grid=geometry.Grid((0.0, 0.0), (1e-3, 1e-3), (4, 4)),
-            velocity=np.zeros((near.frames, 2, 4, 4)), mask=np.ones((4, 4), bool), rho=1.0, mu=0.0,
+            time=near.time,
+            grid=geometry.Grid((0.0, 0.0), (1e-3, 1e-3), (4, 4)),
+            velocity=np.zeros((near.frames, 2, 4, 4)),
+            mask=np.ones((4, 4), bool),
+            rho=1.0,
+            mu=0.0,
             wall=geometry.Wall(
                 np.array([[0, 0], [3e-3, 0], [0, 3e-3]]), np.array([[0, 1], [1, 2], [2, 0]]), np.zeros(3)
             ),

@@ -44,14 +44,17 @@ def measured_twin(model: Simulator, wall: geometry.Wall, true: dict[str, float])
         fields.append(run.fetch(grid, torch.ones(grid.shape, dtype=torch.bool)).value[0].numpy())
     velocity = np.stack(fields) + NOISE * np.random.default_rng(0).standard_normal((FRAMES, 2, *grid.shape))
     return geometry.Recording(
-        time=time, grid=grid, velocity=velocity.astype(np.float32), mask=np.ones((FRAMES, *grid.shape), bool),
-        wall=wall, rho=DENSITY, mu=VISCOSITY,
-    )  # fmt: skip
+        time=time,
+        grid=grid,
+        velocity=velocity.astype(np.float32),
+        mask=np.ones((FRAMES, *grid.shape), bool),
+        wall=wall,
+        rho=DENSITY,
+        mu=VISCOSITY,
+    )
 
 
-@pytest.mark.parametrize(
-    "strength,viscosity", [(1.5, 0.06), pytest.param(0.7, 0.15, marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize("strength,viscosity", [(1.5, 0.06), pytest.param(0.7, 0.15, marks=pytest.mark.slow)])
 def test_valve_strength_and_viscosity_are_found_together(strength, viscosity):
     """Within 4 and 8 % from guesses that are up to 50 and 67 % off; measured 0.1 and 2.4, 2.0 and 4.2 %."""
     model, wall = channel()

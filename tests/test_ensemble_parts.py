@@ -176,8 +176,14 @@ def test_a_source_sees_its_own_nodes_its_beam_and_its_blur(measured):
     beam = np.zeros((3, *shifted.shape), np.float32)
     beam[1], beam[2] = 0.6, 0.8
     other = geometry.Recording(
-        time=measured.time, grid=shifted, velocity=np.zeros((2, 3, *shifted.shape), np.float32), mask=inside,
-        wall=measured.wall, rho=measured.rho, mu=measured.mu, beam=beam,
+        time=measured.time,
+        grid=shifted,
+        velocity=np.zeros((2, 3, *shifted.shape), np.float32),
+        mask=inside,
+        wall=measured.wall,
+        rho=measured.rho,
+        mu=measured.mu,
+        beam=beam,
     )
     source = Source(other, plain_error(other), measured.grid)
     seen = source.see(0)

@@ -40,9 +40,13 @@ def test_every_start_has_a_name_of_its_own_in_the_store_that_torchrun_keeps():
 def launched(folder: Path, *command: str) -> subprocess.Popen:
     path = os.pathsep.join([str(PACKAGES), os.environ.get("PYTHONPATH", "")])
     return subprocess.Popen(
-        [sys.executable, *command], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=folder,
+        [sys.executable, *command],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=folder,
         env={**os.environ, "PYTHONPATH": path, "OMP_NUM_THREADS": "1"},
-    )  # fmt: skip
+    )
 
 
 def finished(run: subprocess.Popen) -> None:

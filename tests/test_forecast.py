@@ -23,8 +23,13 @@ def solid_rotation(frames=4, step=0.005):
     time = step * np.arange(frames)
     wall = geometry.Wall(BALL.vertices, BALL.faces, BALL.region)
     return geometry.Recording(
-        time=time, grid=grid, velocity=np.stack([field] * frames).astype(np.float32), mask=mask, wall=wall,
-        rho=1060.0, mu=1e-6,
+        time=time,
+        grid=grid,
+        velocity=np.stack([field] * frames).astype(np.float32),
+        mask=mask,
+        wall=wall,
+        rho=1060.0,
+        mu=1e-6,
     )
 
 

@@ -90,15 +90,11 @@ def test_any_closest_point_equals_a_search_over_all_faces() -> None:
     found = SurfaceIndex(surface).query(points)
     triangles = vertices[surface.faces]
     for row in range(0, 300, 3):
-        nearest = trimesh.triangles.closest_point(
-            triangles, np.repeat(points[row : row + 1], len(triangles), axis=0)
-        )
+        nearest = trimesh.triangles.closest_point(triangles, np.repeat(points[row : row + 1], len(triangles), axis=0))
         best = np.linalg.norm(nearest - points[row], axis=1).min()
         assert found.distance[row] == pytest.approx(best, rel=1e-9, abs=1e-12)
     np.testing.assert_allclose(found.weights.sum(1), 1, atol=1e-12)
-    np.testing.assert_allclose(
-        np.linalg.norm(found.point(surface) - points, axis=1), found.distance, rtol=1e-12
-    )
+    np.testing.assert_allclose(np.linalg.norm(found.point(surface) - points, axis=1), found.distance, rtol=1e-12)
 
 
 def test_points_of_the_surface_have_no_distance() -> None:
@@ -158,9 +154,7 @@ def test_a_box_that_moves_several_spacings_between_frames_stays_exact(frames: in
 
 def test_the_interpolated_distance_normal_and_velocity_of_a_growing_sphere() -> None:
     sphere, times = ellipsoid((1.0, 1.0, 1.0), 0.04), np.linspace(0, 1, 2)
-    motion = WallMotion.through(
-        times, sphere.vertices * (1 + 0.3 * times[:, None, None]), sphere.faces, sphere.region
-    )
+    motion = WallMotion.through(times, sphere.vertices * (1 + 0.3 * times[:, None, None]), sphere.faces, sphere.region)
     spacing = 0.15
     grid = Grid.covering((-1.6,) * 3, (1.6,) * 3, spacing)
     moving = MovingDistance(grid, motion, band=0.5)

@@ -78,9 +78,7 @@ def test_derivatives_with_respect_to_field_and_points() -> None:
     field = torch.randn(2, 3, 4, generator=_random(9), dtype=torch.float64, requires_grad=True)
     points = torch.tensor([[0.3, 0.4], [1.7, 1.2], [2.4, 0.9]], dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(grid.sample, (field, points))
-    assert torch.autograd.gradcheck(
-        grid.spread, (grid.sample(field, points).detach().requires_grad_(), points)
-    )
+    assert torch.autograd.gradcheck(grid.spread, (grid.sample(field, points).detach().requires_grad_(), points))
 
 
 def test_float32_stays_float32() -> None:

@@ -48,9 +48,7 @@ def test_self_touching_walls_keep_their_sign() -> None:
     touching.check()
     grid = Grid.covering((-0.45, -0.45, 0.15), (2.45, 2.45, 0.85), 0.1)
     nodes = grid.nodes().numpy()
-    inside = ((nodes[:, :2] > 0) & (nodes[:, :2] < 1)).all(1) | ((nodes[:, :2] > 1) & (nodes[:, :2] < 2)).all(
-        1
-    )
+    inside = ((nodes[:, :2] > 0) & (nodes[:, :2] < 1)).all(1) | ((nodes[:, :2] > 1) & (nodes[:, :2] < 2)).all(1)
     distance = signed_distance(grid, touching).ravel()
     np.testing.assert_array_equal(distance > 0, inside)
     exact = np.minimum(np.abs(nodes[:, 0] - np.rint(nodes[:, 0])), np.abs(nodes[:, 1] - np.rint(nodes[:, 1])))
@@ -121,9 +119,7 @@ def test_a_wall_that_outruns_the_grid_between_two_frames() -> None:
 
 def test_orifices_survive_key_frames_far_apart() -> None:
     shape = Ventricle()
-    motion = WallMotion.from_recording(
-        shape.recording([0.0, 0.12, 0.4], grid_spacing=3e-3, wall_spacing=2e-3)
-    )
+    motion = WallMotion.from_recording(shape.recording([0.0, 0.12, 0.4], grid_spacing=3e-3, wall_spacing=2e-3))
     for t in (0.03, 0.2, 0.37):
         for opening in orifices(motion):
             np.testing.assert_allclose(opening.normal(t), [0, 0, 1], atol=1e-9)

@@ -77,9 +77,7 @@ def test_volume_rate_is_the_flux_swept_by_the_wall_region_by_region() -> None:
     surface, velocity = motion.surface(0.4), motion.velocity(0.4)
     corner, speed = surface.vertices[surface.faces], velocity[surface.faces]
     weights = np.random.default_rng(0).dirichlet(np.ones(3), 4000)
-    weights = np.concatenate(
-        [weights, 2 / 3 - weights]
-    )  # mirrored at the centroid: exact for linear functions
+    weights = np.concatenate([weights, 2 / 3 - weights])  # mirrored at the centroid: exact for linear functions
     flux = np.einsum("sk,fkd->fsd", weights, speed).mean(1)
     normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]) / 2
     assert (flux * normal).sum() == pytest.approx(total, rel=1e-10)
@@ -87,9 +85,7 @@ def test_volume_rate_is_the_flux_swept_by_the_wall_region_by_region() -> None:
 
 def test_the_area_of_a_plane_outline_changes_with_the_flux_through_it() -> None:
     outline, times = ellipse((1.0, 2.0), 0.1), np.linspace(0, 1, 4)
-    motion = WallMotion.through(
-        times, outline.vertices * (1 + times[:, None, None]), outline.faces, outline.region
-    )
+    motion = WallMotion.through(times, outline.vertices * (1 + times[:, None, None]), outline.faces, outline.region)
     assert motion.volume(0.5) == pytest.approx(outline.volume * 2.25, rel=1e-12)
     assert motion.volume_rate(0.5) == pytest.approx(outline.volume * 3.0, rel=1e-12)
 
@@ -107,9 +103,7 @@ def _recording(box_recording: Callable[..., Recording], times: tuple[float, ...]
     return box_recording(lambda p, t: 0 * p, times=times, period=period, wall_velocity=lambda p: 0 * p)
 
 
-@pytest.mark.parametrize(
-    ("times", "keys"), [((0.0, 0.1, 0.2), 4), ((0.0, 0.1, 0.2, 0.3), 4), ((0.0, 0.2, 0.4), 3)]
-)
+@pytest.mark.parametrize(("times", "keys"), [((0.0, 0.1, 0.2), 4), ((0.0, 0.1, 0.2, 0.3), 4), ((0.0, 0.2, 0.4), 3)])
 def test_a_recordings_period_is_closed(box_recording: Callable, times: tuple, keys: int) -> None:
     motion = WallMotion.from_recording(_recording(box_recording, times, 0.3))
     assert len(motion.time) == keys
@@ -120,9 +114,7 @@ def test_a_recordings_period_is_closed(box_recording: Callable, times: tuple, ke
 def test_of_several_recorded_beats_each_keeps_its_own_motion(box_recording: Callable) -> None:
     recording = _recording(box_recording, (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6), 0.3)
     grown = recording.wall.vertices * (1 + recording.time[:, None, None])
-    motion = WallMotion.through(
-        recording.time, grown, recording.wall.faces, recording.wall.region, period=0.3
-    )
+    motion = WallMotion.through(recording.time, grown, recording.wall.faces, recording.wall.region, period=0.3)
     for t, same in ((0.15, 0.15), (0.45, 0.45), (0.75, 0.45), (-0.2, 0.1), (1.05, 0.45)):
         np.testing.assert_allclose(motion.vertices(t), motion.vertices(same), atol=1e-15)
     assert motion.volume(0.45) > 1.5 * motion.volume(0.15)

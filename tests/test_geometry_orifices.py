@@ -22,9 +22,7 @@ from geometry import (
 )
 
 SHAPE = Ventricle()
-MOTION = WallMotion.from_recording(
-    SHAPE.recording(np.linspace(0, 0.44, 45), grid_spacing=3e-3, wall_spacing=0.6e-3)
-)
+MOTION = WallMotion.from_recording(SHAPE.recording(np.linspace(0, 0.44, 45), grid_spacing=3e-3, wall_spacing=0.6e-3))
 
 
 def _turned(motion: WallMotion, angle: float, shift: np.ndarray) -> WallMotion:
@@ -180,17 +178,13 @@ def test_smooth_normals_follow_the_curve_of_a_coarse_mesh() -> None:
 def test_points_of_a_plane_outline() -> None:
     motion = WallMotion.through(
         np.array([0.0, 1.0]),
-        np.stack(
-            [(1 + k) * polygon(np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]]), 0.5).vertices for k in (0, 1)]
-        ),
+        np.stack([(1 + k) * polygon(np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]]), 0.5).vertices for k in (0, 1)]),
         polygon(np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]]), 0.5).faces,
         np.zeros(8, np.uint8),
     )
     wall = wall_points(motion, 0.5, 0.1, smooth_angle=0)
     assert wall.areas.sum() == pytest.approx(6.0)
-    assert (wall.areas * (wall.normals * wall.velocities).sum(1)).sum() == pytest.approx(
-        motion.volume_rate(0.5)
-    )
+    assert (wall.areas * (wall.normals * wall.velocities).sum(1)).sum() == pytest.approx(motion.volume_rate(0.5))
 
 
 def test_wall_points_refuse_nonsense() -> None:

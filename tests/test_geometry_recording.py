@@ -38,9 +38,7 @@ def _full(box_recording: Callable[..., Recording]) -> Recording:
         "flux_mitral": [0.0, 1e-6, 0.0],
         "flux_aortic": [0.0, 0.0, -1e-6],
     }
-    wanted = {
-        name: getattr(plain, name) for name in ("time", "grid", "velocity", "mask", "wall", "rho", "mu")
-    }
+    wanted = {name: getattr(plain, name) for name in ("time", "grid", "velocity", "mask", "wall", "rho", "mu")}
     return Recording(**wanted, **extra, period=0.0, description="a box")
 
 
@@ -64,9 +62,7 @@ def test_round_trip_keeps_every_array_and_number(full: Recording, path: Path) ->
     _assert_equal(full, read_recording(path))
 
 
-@pytest.mark.parametrize(
-    "options", [{}, {"compression": "lzf"}, {"compression": "gzip", "chunks": (1, 1, 2, 3, 3)}]
-)
+@pytest.mark.parametrize("options", [{}, {"compression": "lzf"}, {"compression": "gzip", "chunks": (1, 1, 2, 3, 3)}])
 def test_any_chunking_and_the_named_compressions_are_read(path: Path, full: Recording, options: dict) -> None:
     with h5py.File(path, "r+") as file:
         values = file["velocity"][()]
@@ -80,9 +76,7 @@ def test_plane_recordings_have_two_components_and_polylines(box_recording: Calla
     write_recording(tmp_path / "plane.h5", plane)
     back = read_recording(tmp_path / "plane.h5")
     _assert_equal(plane, back)
-    assert (
-        back.dimension == 2 and back.velocity.shape[1] == 2 and back.wall.at(0).volume == pytest.approx(1e-4)
-    )
+    assert back.dimension == 2 and back.velocity.shape[1] == 2 and back.wall.at(0).volume == pytest.approx(1e-4)
 
 
 def test_static_mask_and_wall_serve_every_frame(path: Path, full: Recording) -> None:
@@ -251,9 +245,7 @@ def test_a_group_in_the_place_of_a_dataset_is_refused(path: Path) -> None:
         read_recording(path)
 
 
-def test_links_inside_the_file_are_followed_and_others_refused(
-    path: Path, full: Recording, tmp_path: Path
-) -> None:
+def test_links_inside_the_file_are_followed_and_others_refused(path: Path, full: Recording, tmp_path: Path) -> None:
     other = tmp_path / "other.h5"
     write_recording(other, full)
     with h5py.File(path, "r+") as file:
@@ -281,9 +273,7 @@ def test_external_storage_and_virtual_datasets_are_refused(path: Path, tmp_path:
     with h5py.File(path, "r+") as file:
         shape = file["velocity"].shape
         del file["velocity"]
-        file.create_dataset(
-            "velocity", shape, "f4", external=[(str(tmp_path / "raw.bin"), 0, h5py.h5f.UNLIMITED)]
-        )
+        file.create_dataset("velocity", shape, "f4", external=[(str(tmp_path / "raw.bin"), 0, h5py.h5f.UNLIMITED)])
     with pytest.raises(RecordingError, match="/velocity: keeps its data in another file"):
         read_recording(path)
     with h5py.File(path, "r+") as file:

@@ -107,9 +107,7 @@ def test_refining_bounds_the_edges_and_changes_nothing_else(surface: Surface) ->
     for label in np.unique(surface.region):
         area = surface.areas[surface.part(label)].sum()
         assert result.areas[result.part(label)].sum() == pytest.approx(area, rel=1e-12)
-    assert refined(surface, 1e9).faces is not result.faces and len(refined(surface, 1e9).faces) == len(
-        surface.faces
-    )
+    assert refined(surface, 1e9).faces is not result.faces and len(refined(surface, 1e9).faces) == len(surface.faces)
 
 
 def test_refined_triangles_keep_their_shape() -> None:

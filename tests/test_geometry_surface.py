@@ -151,15 +151,10 @@ def test_trimesh_agrees() -> None:
     mesh = tube(1.0, 2.0, 0.3).trimesh()
     assert mesh.is_watertight and mesh.is_winding_consistent
     assert mesh.volume == pytest.approx(tube(1.0, 2.0, 0.3).volume, rel=1e-12)
-    assert (
-        np.bincount(mesh.face_attributes["region"]).tolist()
-        == np.bincount(tube(1.0, 2.0, 0.3).region).tolist()
-    )
+    assert np.bincount(mesh.face_attributes["region"]).tolist() == np.bincount(tube(1.0, 2.0, 0.3).region).tolist()
 
 
-@pytest.mark.parametrize(
-    "surface", [SPHERE, ellipse((1.0, 0.6), 0.05), tube(0.6, 0.9, 0.2)], ids=["3d", "2d", "tube"]
-)
+@pytest.mark.parametrize("surface", [SPHERE, ellipse((1.0, 0.6), 0.05), tube(0.6, 0.9, 0.2)], ids=["3d", "2d", "tube"])
 def test_grid_winding_equals_the_sum_of_angles(surface: Surface) -> None:
     grid = Grid.covering((-1.1,) * surface.dimension, (1.1,) * surface.dimension, 0.2)
     nodes = grid.nodes().numpy()

@@ -58,9 +58,7 @@ def test_resolving_relative_imports(tmp_path, monkeypatch):
     monkeypatch.setattr("test_imports.ROOT", tmp_path)
     file = tmp_path / "torchsph" / "pairs" / "one.py"
     file.parent.mkdir(parents=True)
-    file.write_text(
-        "from ..walls import a\nfrom . import b\nimport numpy.linalg\nfrom geometry import Grid\n"
-    )
+    file.write_text("from ..walls import a\nfrom . import b\nimport numpy.linalg\nfrom geometry import Grid\n")
     assert imported(file) >= {"torchsph.walls", "torchsph.pairs.b", "numpy.linalg", "geometry.Grid"}
 
 
@@ -91,16 +89,12 @@ def test_every_dependency_is_declared(package):
 
 def test_the_simulator_never_sees_a_measurement():
     """No part of the engine knows the filters or the ultrasound: no inverse crime by construction."""
-    engine = [
-        p for p in modules("torchsph") if set(p.relative_to(ROOT).with_suffix("").parts) & set(SIMULATOR)
-    ]
+    engine = [p for p in modules("torchsph") if set(p.relative_to(ROOT).with_suffix("").parts) & set(SIMULATOR)]
     offences = {
         f"{path.name} imports {name}"
         for path in engine
         for name in imported(path)
-        if name.startswith(
-            ("torchsph.assimilation", "torchsph.ultrasound", "torchsph.pipeline", "torchsph.metrics")
-        )
+        if name.startswith(("torchsph.assimilation", "torchsph.ultrasound", "torchsph.pipeline", "torchsph.metrics"))
     }
     assert engine and not offences
 

@@ -109,9 +109,7 @@ def _along_last(speed):
 
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_wall_that_moves_with_the_flow_lets_nothing_through(box_recording, dimension):
-    recording = box_recording(
-        _along_x(0.05), dimension=dimension, wall_velocity=lambda v: _along_x(0.05)(v, 0.0)
-    )
+    recording = box_recording(_along_x(0.05), dimension=dimension, wall_velocity=lambda v: _along_x(0.05)(v, 0.0))
     assert metrics.evaluate(recording)["wall_normal_rms"].value == pytest.approx(0.0, abs=1e-7)
 
 
@@ -130,9 +128,7 @@ def test_flow_rate_against_the_growth_of_the_volume(box_recording, dimension, sp
 def test_flow_rate_prefers_the_fluxes_of_the_truth(box_recording):
     inflow = np.array([1e-6, 2e-6, 3e-6])
     truth = box_recording(_along_last(0.0), flux_mitral=1.5 * inflow, flux_aortic=-0.5 * inflow)
-    recording = box_recording(
-        lambda p, t: _along_last(-(1 + 100 * t) * 0.01)(p, t)
-    )  # 0.01 m/s through (10 mm)^2
+    recording = box_recording(lambda p, t: _along_last(-(1 + 100 * t) * 0.01)(p, t))  # 0.01 m/s through (10 mm)^2
     scores = metrics.evaluate(recording, truth)
     assert scores["flow_rate_error"].value == pytest.approx(0.0, abs=1e-5)
 

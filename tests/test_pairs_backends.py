@@ -120,11 +120,11 @@ class TestTerms:
             given = None if start is None else start.to(dtype)
             enough = 1e-5 if single else 1e-11
             got = fast.poisson(pairs, state, lengths, state.pressure, given, tolerance=enough, **asked)
-            wanted = REFERENCE.poisson(
-                wanted_pairs, wide, lengths, wide.pressure, start, tolerance=1e-12, **asked
-            )
+            wanted = REFERENCE.poisson(wanted_pairs, wide, lengths, wide.pressure, start, tolerance=1e-12, **asked)
             torch.testing.assert_close(
-                got.values.double(), wanted.values, rtol=0.0,
+                got.values.double(),
+                wanted.values,
+                rtol=0.0,
                 atol=float(wanted.values.abs().max()) * (2e-4 if single else 1e-9),
             )
             torch.testing.assert_close(got.mismatch, wanted.mismatch, rtol=1e-6, atol=1e-7 if single else 1e-12)
@@ -147,7 +147,13 @@ class TestTerms:
                 state.position, state.member, fields, lengths, query, member, period=period, weight=weight
             )
             wanted = REFERENCE.interpolate(
-                wide.position, wide.member, fields.double(), lengths, query.double(), member, period=period,
+                wide.position,
+                wide.member,
+                fields.double(),
+                lengths,
+                query.double(),
+                member,
+                period=period,
                 weight=None if weight is None else weight.double(),
             )
             assert_close(got, wanted, dtype)
@@ -184,9 +190,7 @@ class TestArrangements:
     def test_turned_and_moved(self, fast, dimension, dtype):
         state, choice = disordered(9, dimension, dtype), support("cubic", dimension)
         generator = torch.Generator().manual_seed(3)
-        turn, _ = torch.linalg.qr(
-            torch.randn((dimension, dimension), generator=generator, dtype=torch.float64)
-        )
+        turn, _ = torch.linalg.qr(torch.randn((dimension, dimension), generator=generator, dtype=torch.float64))
         turn = turn.to(dtype)
         rates, acceleration = self.sums(fast, state, choice)
         moved = changed(state, lambda t: t)
@@ -251,9 +255,7 @@ def test_threads_change_nothing(fast):
         for threads in (1, 2, 3):
             torch.set_num_threads(threads)
             pairs = fast.search(state.position, state.member, choice.radius)
-            results.append(
-                fast.right_hand_side(pairs, state, choice, TestArrangements.terms, TestArrangements.forces)
-            )
+            results.append(fast.right_hand_side(pairs, state, choice, TestArrangements.terms, TestArrangements.forces))
     finally:
         torch.set_num_threads(before)
     for rates, acceleration in results[1:]:

@@ -33,8 +33,16 @@ def solved(solver, state, source, *, free=None, tolerance=1e-6, iterations=400):
     pairs = solver.search(state.position, state.member, RADIUS)
     pinned = torch.tensor([bool((~free)[state.member == m].any()) for m in range(members)])
     return solver.poisson(
-        pairs, state, support("wendland_c2", state.position.shape[1], 1.3), source, None, free=free, active=active,
-        singular=~pinned, tolerance=tolerance, iterations=iterations,
+        pairs,
+        state,
+        support("wendland_c2", state.position.shape[1], 1.3),
+        source,
+        None,
+        free=free,
+        active=active,
+        singular=~pinned,
+        tolerance=tolerance,
+        iterations=iterations,
     )
 
 
@@ -71,8 +79,12 @@ def test_a_member_is_solved_as_alone_on_any_number_of_threads(backends, dtype):
         for member in range(3):
             mine = state.member == member
             alone = type(state)(
-                state.position[mine], state.velocity[mine], state.mass[mine], state.deviation[mine],
-                state.pressure[mine], torch.zeros(int(mine.sum()), dtype=torch.int64),
+                state.position[mine],
+                state.velocity[mine],
+                state.mass[mine],
+                state.deviation[mine],
+                state.pressure[mine],
+                torch.zeros(int(mine.sum()), dtype=torch.int64),
             )
             found = solved(fast, alone, alone.pressure, tolerance=1e-3)
             assert torch.equal(found.values, together.values[mine])
@@ -93,8 +105,16 @@ def test_groups_that_share_clusters_do_without(backends):
     values = []
     for one in (fast, plain):
         found = one.poisson(
-            one.search(shifted, state.member, RADIUS), state, support("wendland_c2", 2, 1.3), state.pressure, None,
-            free=everything, active=everything, singular=torch.tensor([True, True]), tolerance=1e-10, iterations=400,
+            one.search(shifted, state.member, RADIUS),
+            state,
+            support("wendland_c2", 2, 1.3),
+            state.pressure,
+            None,
+            free=everything,
+            active=everything,
+            singular=torch.tensor([True, True]),
+            tolerance=1e-10,
+            iterations=400,
             group=part,
         )
         assert bool(found.converged.all())

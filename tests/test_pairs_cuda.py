@@ -65,9 +65,7 @@ class TestTerms:
         side = 8 if dimension == 2 else 4 + 2 * periodic
         choice = support("wendland_c2", dimension, 0.95)
         period = torch.full((dimension,), float(side), dtype=dtype) if periodic else None
-        return choice, both(
-            fast, disordered(side, dimension, dtype, members=1 + (not periodic)), choice.radius, period
-        )
+        return choice, both(fast, disordered(side, dimension, dtype, members=1 + (not periodic)), choice.radius, period)
 
     def test_rates_and_forces(self, fast, dtype, dimension, periodic):
         choice, (state, pairs, wide, wanted) = self.arrange(fast, dtype, dimension, periodic)
@@ -121,9 +119,7 @@ def test_missing_device_is_explained():
     status = next(s for s in available_backends("cpu") if s.name == "cuda")
     assert not status.present and "CUDA tensors only" in status.reason
     if not torch.cuda.is_available():
-        with pytest.raises(
-            ValueError, match="'cuda' was asked for and cannot be used: torch finds no CUDA device"
-        ):
+        with pytest.raises(ValueError, match="'cuda' was asked for and cannot be used: torch finds no CUDA device"):
             backend("cuda", "cuda")
 
 

@@ -119,9 +119,7 @@ class TestArrangements:
         check(either, random_state(lattice), support("wendland_c2", dimension, 1.0))
 
     def test_member_without_particles_and_unequal_members(self, either, dimension, dtype):
-        position = torch.cat(
-            [disordered(6, dimension, dtype).position, disordered(3, dimension, dtype).position]
-        )
+        position = torch.cat([disordered(6, dimension, dtype).position, disordered(3, dimension, dtype).position])
         member = torch.full((position.shape[0],), 4)
         member[6**dimension :] = 1
         check(either, random_state(position, member))

@@ -65,9 +65,7 @@ class TestOperators:
             [plan.CONTINUITY | plan.CONCENTRATION, 0, 0, 0],
             [2.0, 0.4],
         )
-        torch.library.opcheck(
-            operators.pair_pass, (*arguments, coefficients, *arrays), test_utils=self.checks
-        )
+        torch.library.opcheck(operators.pair_pass, (*arguments, coefficients, *arrays), test_utils=self.checks)
         assert plan.Pass(terms, 0).outputs == ["divergence", "concentration", "acceleration"]
 
     def test_interpolation(self):
@@ -94,9 +92,7 @@ class TestOperators:
         arrays = (state.position, state.velocity, state.mass, state.deviation, None, None, None, None)
         terms = plan.SHEPARD | plan.XSPH
         with pytest.raises(NotImplementedError, match="0x108"):
-            operators.pair_pass(
-                lists, [float("inf")] * 3, [terms, 0, 0, 0], [2.0, 0.4], coefficients, *arrays
-            )
+            operators.pair_pass(lists, [float("inf")] * 3, [terms, 0, 0, 0], [2.0, 0.4], coefficients, *arrays)
 
 
 @needs_cpu
@@ -153,9 +149,7 @@ class TestWrongInputs:
         own = SmoothingKernel("cubic", 2.0, lambda q: q, lambda q: q, {3: 1.0}, "nowhere")
         state = disordered(4, 3)
         with pytest.raises(ValueError, match="no kernel 'cubic' compiled in"):
-            backend("cpu").rates(
-                self.pairs(state), state, type(support("cubic", 3))(own, 1.2, 3), RateTerms()
-            )
+            backend("cpu").rates(self.pairs(state), state, type(support("cubic", 3))(own, 1.2, 3), RateTerms())
 
     def test_smoothing_length_of_each_particle(self):
         state = disordered(4, 3)
@@ -177,9 +171,7 @@ def test_gaussian_of_another_truncation():
     state = disordered(6, 3)
     choice = type(support("cubic", 3))(truncated_gaussian(2.5), 0.9, 3)
     fast, reference = backend("cpu"), ReferenceBackend()
-    got = fast.rates(
-        fast.search(state.position, state.member, choice.radius), state, choice, RateTerms(shepard=True)
-    )
+    got = fast.rates(fast.search(state.position, state.member, choice.radius), state, choice, RateTerms(shepard=True))
     pairs = reference.search(state.position, state.member, choice.radius)
     wanted = reference.rates(pairs, state, choice, RateTerms(shepard=True))
     torch.testing.assert_close(got.shepard_mass, wanted.shepard_mass, rtol=1e-12, atol=0)
@@ -197,9 +189,7 @@ class TestChoice:
             backend("warp")
 
     def test_cpu_backend_for_another_device(self):
-        with pytest.raises(
-            ValueError, match="'cpu' was asked for and cannot be used: .*device asked for is 'cuda'"
-        ):
+        with pytest.raises(ValueError, match="'cpu' was asked for and cannot be used: .*device asked for is 'cuda'"):
             backend("cpu", "cuda")
 
     def test_without_libraries(self, monkeypatch, tmp_path):
@@ -232,9 +222,7 @@ class TestChoice:
         monkeypatch.setenv(native.FORCED, "avx1024")
         native.library.cache_clear()
         try:
-            with pytest.raises(
-                ValueError, match="TORCHSPH_ISA=avx1024 is unknown; known: avx512, avx2, baseline"
-            ):
+            with pytest.raises(ValueError, match="TORCHSPH_ISA=avx1024 is unknown; known: avx512, avx2, baseline"):
                 backend("cpu")
         finally:
             monkeypatch.undo()
@@ -307,9 +295,7 @@ def compare_with_reference(fast, dimension: int, name: str, dtype: torch.dtype) 
     assert_close(got[1], wanted[1], dtype)
     query = state.position + 0.2
     got = fast.interpolate(state.position, state.member, state.velocity, choice, query, state.member)
-    wanted = reference.interpolate(
-        wide.position, wide.member, wide.velocity, choice, query.double(), wide.member
-    )
+    wanted = reference.interpolate(wide.position, wide.member, wide.velocity, choice, query.double(), wide.member)
     assert_close(got, wanted, dtype)
 
 

@@ -125,9 +125,11 @@ def after_steps(scheme, options, dimension, what, centre, every):
 
 @pytest.mark.parametrize(
     ("scheme", "options", "dimension"),
-    [("weakly_compressible", {"sound_speed": 10.0, "shifting": None}, 2),
-     ("projection", {"shifting": None, "relaxation": 2.0}, 2),
-     ("projection", {"shifting": None, "relaxation": 2.0}, 3)],
+    [
+        ("weakly_compressible", {"sound_speed": 10.0, "shifting": None}, 2),
+        ("projection", {"shifting": None, "relaxation": 2.0}, 2),
+        ("projection", {"shifting": None, "relaxation": 2.0}, 3),
+    ],
 )
 def test_a_hole_closes_and_a_crowd_thins_while_the_flow_goes_on(scheme, options, dimension):
     """Within forty steps, over the seams of the box too; without the control both are still there.
@@ -201,9 +203,11 @@ def test_a_hole_at_a_wall_is_filled_and_nothing_lands_beyond(scheme):
 
 def test_options_that_cannot_be():
     for options, message in (
-        ({"every": 0}, "at least 1 step"), ({"closest": 1.5}, "closest must lie in"),
-        ({"heaviest": 0.0}, "heaviest must be positive"), ({"missing": -1.0}, "missing must be positive"),
-    ):  # fmt: skip
+        ({"every": 0}, "at least 1 step"),
+        ({"closest": 1.5}, "closest must lie in"),
+        ({"heaviest": 0.0}, "heaviest must be positive"),
+        ({"missing": -1.0}, "missing must be positive"),
+    ):
         with pytest.raises(ValueError, match=message):
             PopulationControl(**options)
     place = lattice(2)

@@ -126,20 +126,23 @@ def test_a_full_box_under_gravity_bears_its_weight(dtype):
     runs = []
     for gravity in ((0.0, -1.0), None):
         scene = Scene(
-            spacing=1 / 16, fluid=Fluid(1000.0, 1e-2), walls=geometry.WallMotion.at_rest(box), gravity=gravity,
+            spacing=1 / 16,
+            fluid=Fluid(1000.0, 1e-2),
+            walls=geometry.WallMotion.at_rest(box),
+            gravity=gravity,
             dimension=2,
-        )  # fmt: skip
+        )
         runs.append(Simulator(scene, Projection(max_step=5e-3), dtype=dtype).start(0.0))
         runs[-1].advance(0.01)
     heavy, light = (run.particles for run in runs)
-    borne = ((heavy.pressure - light.pressure) * runs[0].units.speed**2).double()  # over the density
+    borne = ((heavy.pressure - light.pressure) * runs[0].units.speed ** 2).double()  # over the density
     height = heavy.position[:, 1].double() / 16
     torch.testing.assert_close(borne - borne.mean(), height.mean() - height, rtol=0, atol=1e-4)
     torch.testing.assert_close(heavy.velocity, light.velocity, rtol=0, atol=1e-5)
     runs[0].advance(0.5)
     p = runs[0].particles
     expected = height.mean() - p.position[:, 1].double() / 16
-    pressure = p.pressure.double() * runs[0].units.speed**2
+    pressure = p.pressure.double() * runs[0].units.speed ** 2
     assert float((pressure - pressure.mean() - expected).abs().max()) < 0.03
     assert float(p.velocity.norm(dim=1).max()) < 0.01
 
@@ -256,10 +259,15 @@ def test_a_free_surface_has_to_be_named():
 
 @pytest.mark.parametrize(
     ("options", "message"),
-    [({"tolerance": 0.0}, "tolerance must be positive"), ({"relaxation": -1.0}, "relaxation must be positive or None"),
-     ({"iterations": 0}, "at least one iteration"), ({"surface": 1.5}, "surface must lie in"),
-     ({"wall": None}, "wall must be a CompleteKernelWall"), ({"shifting_speed": "mean"}, "shifting_speed must be")],
-)  # fmt: skip
+    [
+        ({"tolerance": 0.0}, "tolerance must be positive"),
+        ({"relaxation": -1.0}, "relaxation must be positive or None"),
+        ({"iterations": 0}, "at least one iteration"),
+        ({"surface": 1.5}, "surface must lie in"),
+        ({"wall": None}, "wall must be a CompleteKernelWall"),
+        ({"shifting_speed": "mean"}, "shifting_speed must be"),
+    ],
+)
 def test_options_that_cannot_be(options, message):
     with pytest.raises(ValueError, match=message):
         Projection(**options)

@@ -35,9 +35,7 @@ def test_ci_runs_the_test_command_of_the_readme():
 def test_the_project_file_defines_what_the_commands_need():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     assert project["scripts"]["torchsph"] == "torchsph.cli:main"
-    assert {"pytest", "hypothesis"} <= {
-        re.split(r"\W", need)[0] for need in project["optional-dependencies"]["test"]
-    }
+    assert {"pytest", "hypothesis"} <= {re.split(r"\W", need)[0] for need in project["optional-dependencies"]["test"]}
 
 
 def test_commands_of_the_table_are_those_of_the_program():

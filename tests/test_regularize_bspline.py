@@ -70,9 +70,7 @@ def test_degree_out_of_range_is_refused():
 def test_knots_stencil_matches_direct_products(axes):
     knots = Knots.covering((0.0,) * axes, (5.0, 3.0, 2.0)[:axes], (1.0, 0.5, 0.7)[:axes])
     generator = torch.Generator().manual_seed(0)
-    points = torch.rand(50, axes, generator=generator, dtype=torch.float64) * torch.tensor(
-        (5.0, 3.0, 2.0)[:axes]
-    )
+    points = torch.rand(50, axes, generator=generator, dtype=torch.float64) * torch.tensor((5.0, 3.0, 2.0)[:axes])
     assert knots.inside(points).all()
     cell, t = knots.locate(points)
     dense = torch.zeros(50, knots.nodes, dtype=torch.float64)

@@ -115,9 +115,7 @@ def test_factor_serves_many_right_hand_sides():
     prepared = PreparedSystem(System(knots, 2, list(blocks.values()), 0.3))
     factor, right = prepared.factor(), prepared.gradient()
     both = factor.solve(torch.stack([right, 2 * right], dim=-1))
-    assert torch.allclose(both[..., 1], 2 * both[..., 0]) and torch.allclose(
-        both[..., 0], factor.solve(right)
-    )
+    assert torch.allclose(both[..., 1], 2 * both[..., 0]) and torch.allclose(both[..., 0], factor.solve(right))
 
 
 @pytest.mark.parametrize("axes,degree", [(2, 3), (3, 2), (2, 1)])
@@ -129,9 +127,7 @@ def test_block_tridiagonal_factor_equals_the_banded_one(axes, degree):
     weight = torch.ones(400, 1, dtype=torch.float64)
     prepared = PreparedSystem(System(long, axes, [VectorRows(long, points, points, weight)], 0.3))
     banded, block = prepared.factor(), BlockFactor(prepared.band(), prepared.ordering)
-    right = torch.randn(
-        len(prepared.ordering.nodes), axes, 3, generator=torch.Generator().manual_seed(1)
-    ).double()
+    right = torch.randn(len(prepared.ordering.nodes), axes, 3, generator=torch.Generator().manual_seed(1)).double()
     assert torch.allclose(block.solve(right), banded.solve(right), atol=1e-10)
     assert torch.allclose(block.solve(right[..., 0]), banded.solve(right[..., 0]), atol=1e-10)
     assert block.log_determinant() == pytest.approx(banded.log_determinant(), rel=1e-12)

@@ -56,9 +56,7 @@ def test_ten_percent_outliers():
     measured = flow(points) + 0.1 * torch.randn(4000, 3, generator=generator, dtype=torch.float64)
     clean = Smoother(wall=None, no_slip=None).fit(points, measured)
     hit = torch.rand(4000, generator=generator) < 0.1
-    spoilt = torch.where(
-        hit[:, None], 4 * torch.randn(4000, 3, generator=generator, dtype=torch.float64), measured
-    )
+    spoilt = torch.where(hit[:, None], 4 * torch.randn(4000, 3, generator=generator, dtype=torch.float64), measured)
     robust = Smoother(wall=None, no_slip=None).fit(points, spoilt)
     plain = Smoother(wall=None, no_slip=None, robust=None).fit(points, spoilt)
     errors = [relative_error(field, points, flow(points)) for field in (clean, robust, plain)]

@@ -63,22 +63,14 @@ def test_weight_power_means_weight_to_twice_the_power_in_the_cost():
     )
     velocity = rotation(points)
     squared = Smoother(power=2.0, **GIVEN).fit(points, velocity, w).coefficients
-    assert torch.allclose(
-        squared, Smoother(power=1.0, **GIVEN).fit(points, velocity, w**2).coefficients, atol=1e-10
-    )
-    assert not torch.allclose(
-        squared, Smoother(power=1.0, **GIVEN).fit(points, velocity, w).coefficients, atol=1e-4
-    )
+    assert torch.allclose(squared, Smoother(power=1.0, **GIVEN).fit(points, velocity, w**2).coefficients, atol=1e-10)
+    assert not torch.allclose(squared, Smoother(power=1.0, **GIVEN).fit(points, velocity, w).coefficients, atol=1e-4)
 
 
 def test_doubled_samples_and_scaled_weights_change_nothing():
     points, velocity = cloud(), rotation(cloud())
     once = Smoother(**GIVEN).fit(points, velocity).coefficients
-    twice = (
-        Smoother(**GIVEN)
-        .fit(points.repeat(2, 1), velocity.repeat(2, 1), torch.full((1200,), 0.5))
-        .coefficients
-    )
+    twice = Smoother(**GIVEN).fit(points.repeat(2, 1), velocity.repeat(2, 1), torch.full((1200,), 0.5)).coefficients
     assert torch.allclose(once, twice, atol=1e-9)
 
 
@@ -86,9 +78,7 @@ def test_larger_box_changes_nothing_inside():
     points, velocity = cloud(), rotation(cloud())
     step, lower, upper = 3e-3, (0.0, 0.0, 0.0), (12e-3, 9e-3, 15e-3)
     small = Smoother(knots=step, **GIVEN).fit(points, velocity, box=(lower, upper))
-    wide = Smoother(knots=step, **GIVEN).fit(
-        points, velocity, box=([-2 * step] * 3, [u + 4 * step for u in upper])
-    )
+    wide = Smoother(knots=step, **GIVEN).fit(points, velocity, box=([-2 * step] * 3, [u + 4 * step for u in upper]))
     assert torch.allclose(small(points), wide(points), atol=1e-8)
 
 
@@ -100,9 +90,7 @@ def test_moving_wall_right_hand_side():
     inside = sphere(200, 2e-3, centre)[0]
     options = Smoother(divergence=None, wall=1e3, no_slip=None, curvature=0.5e-3, **GIVEN)
     field = options.fit(inside, torch.zeros_like(inside), wall=wall)
-    assert torch.allclose(
-        (field(where) * normals).sum(1), torch.full((400,), 0.2, dtype=torch.float64), atol=5e-3
-    )
+    assert torch.allclose((field(where) * normals).sum(1), torch.full((400,), 0.2, dtype=torch.float64), atol=5e-3)
     fixed = options.fit(inside, torch.zeros_like(inside), wall=WallRows(where, normals, 0 * normals))
     assert float(fixed(where).norm(dim=1).max()) < 1e-6
 
@@ -111,9 +99,7 @@ def test_no_slip_holds_the_whole_vector_and_only_where_asked():
     centre = torch.tensor([6e-3, 6e-3, 6e-3], dtype=torch.float64)
     where, normals = sphere(400, 5e-3, centre)
     inside = sphere(300, 4e-3, centre)[0]
-    flow = torch.linalg.cross(
-        inside - centre, torch.tensor([[0.0, 0, 50.0]], dtype=torch.float64).expand(300, 3)
-    )
+    flow = torch.linalg.cross(inside - centre, torch.tensor([[0.0, 0, 50.0]], dtype=torch.float64).expand(300, 3))
     options = Smoother(divergence=None, wall=100.0, no_slip=100.0, curvature=0.2e-3, **GIVEN)
     slip = torch.zeros(400, dtype=torch.bool)
     free = options.fit(inside, flow, wall=WallRows(where, normals, 0 * normals, no_slip=slip))

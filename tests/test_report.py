@@ -29,9 +29,7 @@ def test_cut_shows_the_field_inside_the_walls_alone(box_recording, dimension):
     # half a cell off the walls and farther in, the multilinear interpolation of a linear field is exact
     deep = ((points > 0.4e-3) & (points < 0.01 - 0.4e-3)).all(-1)
     np.testing.assert_allclose(picture.speed[deep], points[deep][:, 0] / 0.01, rtol=1e-5)
-    np.testing.assert_allclose(
-        np.abs(picture.velocity[1][deep]), abs(plane.along[-1]) * picture.speed[deep], rtol=1e-5
-    )
+    np.testing.assert_allclose(np.abs(picture.velocity[1][deep]), abs(plane.along[-1]) * picture.speed[deep], rtol=1e-5)
 
 
 def test_plane_passes_through_both_orifices_and_the_long_axis():
@@ -74,9 +72,7 @@ def test_report_of_any_kind_of_recording(box_recording, dimension, with_truth, t
     measured = box_recording(linear, dimension=dimension)
     truth = measured if with_truth else None
     analyses = {"spline": measured.with_velocity(0.9 * measured.velocity)}
-    scores = {
-        name: metrics.evaluate(one, truth, measured) for name, one in {"raw": measured, **analyses}.items()
-    }
+    scores = {name: metrics.evaluate(one, truth, measured) for name, one in {"raw": measured, **analyses}.items()}
     report.draw_report(tmp_path / "report.png", measured, analyses, scores, truth, {"spline": 1.0})
     assert matplotlib.image.imread(tmp_path / "report.png")[..., :3].std() > 0.05
 
@@ -85,9 +81,7 @@ def test_table_leaves_out_what_nobody_has(box_recording):
     recording = box_recording(linear)
     heading, row = report.scores_table({"raw": metrics.evaluate(recording)}, {"raw": 0.25})
     assert heading == ["method", "div 1/s", "wall m/s", "flow rate", "seconds"]
-    assert (
-        row[0] == "raw" and row[3] == "-" and row[-1] == "0.25"
-    )  # a still box has no flow rate to compare with
+    assert row[0] == "raw" and row[3] == "-" and row[-1] == "0.25"  # a still box has no flow rate to compare with
 
 
 def test_forecast_picture(tmp_path):

@@ -17,10 +17,17 @@ def end_state(order, steps, viscosity):
     """Positions and velocities of a slightly disordered vortex after a fixed time in ``steps`` steps."""
     scene = Scene(spacing=1 / 16, fluid=Fluid(1.0, viscosity), period=(1.0, 1.0), dimension=2)
     scheme = WeaklyCompressible(
-        order=order, shifting=None, artificial_viscosity=None, bulk_damping=None,
-        density_diffusion=None, sound_speed=5.0, smoothing_ratio=1.5, pressure="sum", courant=5.0,
+        order=order,
+        shifting=None,
+        artificial_viscosity=None,
+        bulk_damping=None,
+        density_diffusion=None,
+        sound_speed=5.0,
+        smoothing_ratio=1.5,
+        pressure="sum",
+        courant=5.0,
         steps_per_frame=steps,
-    )  # fmt: skip
+    )
     axis = torch.arange(16, dtype=torch.float64) + 0.5
     place = torch.cartesian_prod(axis, axis)
     x, y = (2 * math.pi * place / 16).unbind(1)
@@ -43,9 +50,14 @@ def observed(order, viscosity):
 
 @pytest.mark.parametrize(
     ("order", "viscosity", "expected"),
-    [("symplectic", 0.0, 1), ("verlet", 0.0, 2), ("verlet", 0.05, 1), ("predictor_corrector", 0.0, 2),
-     ("predictor_corrector", 0.05, 2)],
-)  # fmt: skip
+    [
+        ("symplectic", 0.0, 1),
+        ("verlet", 0.0, 2),
+        ("verlet", 0.05, 1),
+        ("predictor_corrector", 0.0, 2),
+        ("predictor_corrector", 0.05, 2),
+    ],
+)
 def test_order_of_the_steps(order, viscosity, expected):
     """Verlet loses an order to viscous forces, as its documentation says; the predictor-corrector keeps it."""
     assert observed(order, viscosity) == pytest.approx(expected, abs=0.25)

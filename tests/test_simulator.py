@@ -13,9 +13,7 @@ from torchsph.particles import Particles
 from torchsph.scene import Fluid, Valve
 from torchsph.schemes import PotentialWall
 
-PERIODIC = Scene(
-    spacing=1 / 24, fluid=Fluid(1.0, 0.02), period=(1.0, 1.0), reference_speed=1.0, dimension=2
-)
+PERIODIC = Scene(spacing=1 / 24, fluid=Fluid(1.0, 0.02), period=(1.0, 1.0), reference_speed=1.0, dimension=2)
 
 
 def taylor_green(position):
@@ -77,9 +75,7 @@ def test_a_batch_of_three_equals_three_single_runs():
         single = started(members=1, speeds=(speed,), seed=4)
         single.advance(0.03)
         mine = batch.particles.member == b
-        torch.testing.assert_close(
-            batch.particles.velocity[mine], single.particles.velocity, rtol=1e-9, atol=1e-11
-        )
+        torch.testing.assert_close(batch.particles.velocity[mine], single.particles.velocity, rtol=1e-9, atol=1e-11)
         assert int(batch.record.steps[b]) == int(single.record.steps[0])
 
 

@@ -91,8 +91,9 @@ def test_confidence_of_one_changes_nothing_and_stays_with_its_particle():
 
 def test_particles_that_join_are_trusted():
     one = started(ramp()).particles
-    plain = Particles(**{n: getattr(one, n) for n in ("position", "velocity", "deviation", "mass", "member", "kind")},
-                      members=1)  # fmt: skip
+    plain = Particles(
+        **{n: getattr(one, n) for n in ("position", "velocity", "deviation", "mass", "member", "kind")}, members=1
+    )
     both = one.joined(plain)
     assert torch.equal(both.confidence, torch.cat([one.confidence, torch.ones_like(one.confidence)]))
     assert plain.joined(one).confidence is None

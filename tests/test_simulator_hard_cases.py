@@ -255,8 +255,9 @@ def test_a_hundred_whole_particles_in_the_place_of_one_are_reported():
     """No weakly compressible fluid can be pressed a hundredfold: that member fails, and the other one decays."""
     both = crowded(torch.float64, 1.0)
     sane = particles_at(lattice(20, torch.float64), taylor_green(lattice(20, torch.float64)))
-    start = Particles(**{n: getattr(both, n) for n in ("position", "velocity", "deviation", "mass", "member", "kind")},
-                      members=2).joined(sane.changed(member=sane.member + 1))  # fmt: skip
+    start = Particles(
+        **{n: getattr(both, n) for n in ("position", "velocity", "deviation", "mass", "member", "kind")}, members=2
+    ).joined(sane.changed(member=sane.member + 1))
     run = resumed(PERIODIC, start, rollback=Rollback(tries=1, every=10))
     run.advance(0.05)
     assert run.record.failed.tolist() == [True, False] and run.record.rollbacks.tolist() == [1, 0]

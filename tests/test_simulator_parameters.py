@@ -25,9 +25,13 @@ from torchsph.scene import Fluid
 from torchsph.smoothing import kernel
 
 PLAIN = {
-    "pressure": "sum", "shifting": None, "artificial_viscosity": None, "bulk_damping": None, "density_diffusion": None,
+    "pressure": "sum",
+    "shifting": None,
+    "artificial_viscosity": None,
+    "bulk_damping": None,
+    "density_diffusion": None,
     "laminar_viscosity": False,
-}  # fmt: skip
+}
 
 
 def particles_at(position, velocity, deviation=None, members=1):
@@ -129,9 +133,19 @@ def test_members_with_their_own_viscosity_decay_each_at_its_rate_and_another_one
 
 @pytest.mark.parametrize("backend", ["auto", "reference"])
 @pytest.mark.parametrize(
-    "name", ["smoothing_ratio", "artificial_viscosity", "density_diffusion", "shifting", "bulk_damping", "courant",
-             "gamma", "xsph", "background_pressure"],
-)  # fmt: skip
+    "name",
+    [
+        "smoothing_ratio",
+        "artificial_viscosity",
+        "density_diffusion",
+        "shifting",
+        "bulk_damping",
+        "courant",
+        "gamma",
+        "xsph",
+        "background_pressure",
+    ],
+)
 def test_a_changed_parameter_is_the_scheme_with_that_parameter(name, backend):
     """Each member of a batch moves as a run of its own whose scheme has its value from the start."""
     scene = Scene(spacing=1 / 16, fluid=Fluid(1.0, 0.01), period=(1.0, 1.0), dimension=2)

@@ -86,13 +86,18 @@ def test_a_nan_sample_does_not_spoil_the_others():
         assert not bad[[0, 1, 3, 4, 5]].any()
 
 
-@pytest.mark.parametrize(("make", "message"), [
-    (lambda: FIRFilter(8), "odd"), (lambda: FIRFilter(9, 1.0), "cutoff"),
-    (lambda: PolynomialFilter(-1), "order"),
-    (lambda: SVDFilter(0), "rank"), (lambda: FIRFilter(9).apply(torch.zeros((8, 1)) + 0j), "9 taps"),
-    (lambda: PolynomialFilter(3).apply(torch.zeros((4, 1)) + 0j), "leaves nothing"),
-    (lambda: SVDFilter(3).apply(torch.zeros((3, 1)) + 0j), "leaves nothing"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: FIRFilter(8), "odd"),
+        (lambda: FIRFilter(9, 1.0), "cutoff"),
+        (lambda: PolynomialFilter(-1), "order"),
+        (lambda: SVDFilter(0), "rank"),
+        (lambda: FIRFilter(9).apply(torch.zeros((8, 1)) + 0j), "9 taps"),
+        (lambda: PolynomialFilter(3).apply(torch.zeros((4, 1)) + 0j), "leaves nothing"),
+        (lambda: SVDFilter(3).apply(torch.zeros((3, 1)) + 0j), "leaves nothing"),
+    ],
+)
 def test_what_a_filter_cannot_do_is_refused(make, message):
     with pytest.raises(ValueError, match=message):
         make()

@@ -39,8 +39,7 @@ def test_correlation_equals_its_definition_at_every_lag(name, dtype, close, imag
         kernel = samples[z : z + 5, y : y + 3, x : x + 3, :-2] * np.exp(2j * turn)[..., None]
         for lag in np.ndindex(*shape.lags):
             a, b, c = (
-                n + o + k - s
-                for n, o, k, s in zip((z, y, x), offset[point].tolist(), lag, shape.search, strict=True)
+                n + o + k - s for n, o, k, s in zip((z, y, x), offset[point].tolist(), lag, shape.search, strict=True)
             )
             other = samples[a : a + 5, b : b + 3, c : c + 3, 2:]
             exact = (kernel.conj() * other).sum() / (np.linalg.norm(kernel) * np.linalg.norm(other))
@@ -63,10 +62,16 @@ def test_compiled_sums_over_images_and_boxes_are_those_of_torch(dtype, close):
     found = []
     for one in map(backends.backend, BACKENDS):
         volume, power, turn = one.arrange(images, margin, turns=True)
-        found.append([
-            volume, power, turn, one.mean_power(images), one.box_sums(power, middle, half),
-            *(one.sums_around(turn, widths)(middle) for widths in (half, (0, 9, 5))),
-        ])  # fmt: skip
+        found.append(
+            [
+                volume,
+                power,
+                turn,
+                one.mean_power(images),
+                one.box_sums(power, middle, half),
+                *(one.sums_around(turn, widths)(middle) for widths in (half, (0, 9, 5))),
+            ]
+        )
     for compiled, reference in zip(found[1], found[0], strict=True):
         torch.testing.assert_close(compiled, reference, atol=close, rtol=close)
 
@@ -110,9 +115,7 @@ def test_kernels_outside_the_volume_are_refused():
 def gaussian_peak(curve, vertex, lags):
     """0.9 exp(-quadratic) with second derivatives -curve of its logarithm, times a phase."""
     axis = torch.arange(-(lags // 2), lags // 2 + 1, dtype=torch.float64)
-    offset = (
-        torch.stack(torch.meshgrid(*[axis] * len(vertex), indexing="ij"), -1) - torch.tensor(vertex).double()
-    )
+    offset = torch.stack(torch.meshgrid(*[axis] * len(vertex), indexing="ij"), -1) - torch.tensor(vertex).double()
     height = 0.9 * torch.exp(-0.5 * torch.einsum("...a,ab,...b->...", offset, curve, offset))
     return (height * np.exp(0.7j))[None]
 

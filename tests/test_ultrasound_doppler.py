@@ -56,9 +56,7 @@ def test_nan_and_silence_are_not_accepted():
 
 def test_vectors_from_three_beams_equal_a_dense_weighted_solution():
     generator = torch.Generator().manual_seed(0)
-    beams = torch.nn.functional.normalize(
-        torch.randn((5, 3), generator=generator, dtype=torch.float64), dim=1
-    )
+    beams = torch.nn.functional.normalize(torch.randn((5, 3), generator=generator, dtype=torch.float64), dim=1)
     velocity = torch.randn((7, 3), generator=generator, dtype=torch.float64)
     sigma = 0.5 + torch.rand((5, 7), generator=generator, dtype=torch.float64)
     speed = beams @ velocity.T + torch.randn((5, 7), generator=generator, dtype=torch.float64)

@@ -55,17 +55,13 @@ def test_smooth_noise_has_unit_variance_to_the_edge_and_the_stated_autocorrelati
     for lag, axis, step in ((2, -1, 1e-3), (4, -2, 1e-3), (2, -3, 2e-3)):
         size = noise.shape[axis]
         product = noise.narrow(axis, 0, size - lag) * noise.narrow(axis, lag, size - lag)
-        assert product.mean().item() == pytest.approx(
-            math.exp(-((lag * step) ** 2) / (4 * deviation**2)), abs=0.03
-        )
+        assert product.mean().item() == pytest.approx(math.exp(-((lag * step) ** 2) / (4 * deviation**2)), abs=0.03)
 
 
 def test_gradient_is_exact_for_linear_fields_wherever_a_neighbour_is_inside():
     generator = torch.Generator().manual_seed(4)
     slope = torch.randn((3, 3), generator=generator, dtype=torch.float64)
-    axes = [
-        torch.arange(n, dtype=torch.float64) * step for n, step in zip((6, 7, 8), SPACING[::-1], strict=True)
-    ]
+    axes = [torch.arange(n, dtype=torch.float64) * step for n, step in zip((6, 7, 8), SPACING[::-1], strict=True)]
     z, y, x = torch.meshgrid(*axes, indexing="ij")
     field = torch.einsum("cd,dzyx->czyx", slope, torch.stack([x, y, z]))
     mask = torch.zeros((6, 7, 8), dtype=torch.bool)

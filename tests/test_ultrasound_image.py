@@ -59,10 +59,18 @@ def test_wider_gridding_kernel_comes_closer():
     inside = GRID.contains(points)  # the margin is cut at 1e-3, whatever the gridding
     exact = direct(points[inside], amplitude[inside], beams, acquisition, pointspread)
     error = [
-        float((ParallelImager(GRID, pointspread, acquisition, beams, width=width, dtype=torch.float64)
-               .image(points[inside], amplitude[inside]) - exact).abs().max())
+        float(
+            (
+                ParallelImager(GRID, pointspread, acquisition, beams, width=width, dtype=torch.float64).image(
+                    points[inside], amplitude[inside]
+                )
+                - exact
+            )
+            .abs()
+            .max()
+        )
         for width in (3, 5)
-    ]  # fmt: skip
+    ]
     assert error[1] < 0.3 * error[0]
 
 
@@ -76,9 +84,10 @@ def test_point_spread_given_as_an_array_equals_the_formula():
     sampled = SampledPointSpread(values, (step,) * 3)
     assert sampled.energy(3) == pytest.approx(gaussian.energy(3), rel=1e-3)
     points, amplitude = scatterers(10)
-    images = [ParallelImager(GRID, spread, Acquisition(), Beams(), dtype=torch.float64).image(points,
-    amplitude)
-              for spread in (gaussian, sampled)]  # fmt: skip
+    images = [
+        ParallelImager(GRID, spread, Acquisition(), Beams(), dtype=torch.float64).image(points, amplitude)
+        for spread in (gaussian, sampled)
+    ]
     assert (images[0] - images[1]).abs().max() < 1e-2 * images[0].abs().max()
 
 

@@ -39,10 +39,19 @@ def estimates(count, generator, variance):
     """Made-up estimates whose predicted variance is ``variance`` (n,)."""
     one = torch.ones(count)
     return Estimates(
-        torch.zeros((count, 3)), 0.9 * one, 2 * one, torch.ones((count, 3)),
-        variance[:, None].expand(-1, 3), 0 * one, 20 * one, 0 * one, 10 * one, 0.01 * one,
-        torch.ones(count, dtype=torch.long), torch.zeros(count, dtype=torch.int32),
-    )  # fmt: skip
+        torch.zeros((count, 3)),
+        0.9 * one,
+        2 * one,
+        torch.ones((count, 3)),
+        variance[:, None].expand(-1, 3),
+        0 * one,
+        20 * one,
+        0 * one,
+        10 * one,
+        0.01 * one,
+        torch.ones(count, dtype=torch.long),
+        torch.zeros(count, dtype=torch.int32),
+    )
 
 
 def test_calibration_finds_the_law_that_made_the_errors():
@@ -94,14 +103,11 @@ def test_swirls_have_no_divergence_and_the_stated_speed():
     generator = torch.Generator().manual_seed(3)
     swirl = random_swirl((0.0, 0.0, 0.0), 5e-3, 0.3, generator)
     points = torch.rand((200, 3), generator=generator, dtype=torch.float64) * 4e-3 - 2e-3
-    at = [
-        torch.autograd.functional.jacobian(lambda p: swirl.velocity(p[None], 0.0)[0], p) for p in points[:20]
-    ]
+    at = [torch.autograd.functional.jacobian(lambda p: swirl.velocity(p[None], 0.0)[0], p) for p in points[:20]]
     jacobian = torch.stack(at)
     assert jacobian.diagonal(dim1=1, dim2=2).sum(1).abs().max() < 1e-9 * jacobian.abs().max()
     speeds = [
-        random_swirl((0.0,) * 3, 5e-3, 0.3, generator).velocity(points, 0.0).square().sum(1).mean()
-        for _ in range(60)
+        random_swirl((0.0,) * 3, 5e-3, 0.3, generator).velocity(points, 0.0).square().sum(1).mean() for _ in range(60)
     ]
     assert float(torch.stack(speeds).mean().sqrt()) == pytest.approx(0.3, rel=0.15)
 
@@ -162,9 +168,14 @@ def plane():
     velocity = np.stack([0.15 - 30 * (y - 30e-3), 0.2 + 30 * x]) * mask
     wall = geometry.Wall(surface.vertices, surface.faces, surface.region)
     return geometry.Recording(
-        time=np.array([0.0, 0.01]), grid=grid, velocity=np.stack([velocity] * 2).astype(np.float32),
-        mask=np.stack([mask] * 2), wall=wall, rho=1060.0, mu=4e-3,
-    )  # fmt: skip
+        time=np.array([0.0, 0.01]),
+        grid=grid,
+        velocity=np.stack([velocity] * 2).astype(np.float32),
+        mask=np.stack([mask] * 2),
+        wall=wall,
+        rho=1060.0,
+        mu=4e-3,
+    )
 
 
 def test_a_plane_is_measured_along_parallel_beams_and_in_a_sector(tmp_path):
@@ -188,12 +199,19 @@ def test_a_plane_is_measured_along_parallel_beams_and_in_a_sector(tmp_path):
     assert np.median(np.abs((found.velocity * found.beam).sum(1) - along)[seen]) < 0.03
 
 
-@pytest.mark.parametrize(("options", "message"), [
-    ({"every": 0}, "every"), ({"image_spacing": 0.0}, "image_spacing"),
-    ({"clutter_filter": "magic"}, "clutter_filter"),
-    ({"snr": float("nan")}, "snr"), ({"packet": 4}, "9 taps"), ({"prf": -1.0}, "prf"),
-    ({"beam": (0.0, 0.0)}, "direction"), ({"apex": (0.0, 0.0), "beam": (0.0, 0.0, 1.0)}, "dimension"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"every": 0}, "every"),
+        ({"image_spacing": 0.0}, "image_spacing"),
+        ({"clutter_filter": "magic"}, "clutter_filter"),
+        ({"snr": float("nan")}, "snr"),
+        ({"packet": 4}, "9 taps"),
+        ({"prf": -1.0}, "prf"),
+        ({"beam": (0.0, 0.0)}, "direction"),
+        ({"apex": (0.0, 0.0), "beam": (0.0, 0.0, 1.0)}, "dimension"),
+    ],
+)
 def test_bad_scanner_options_are_refused_by_name(options, message):
     with pytest.raises(ValueError, match=message):
         ScannerOptions(**options)

@@ -42,9 +42,7 @@ def recording(field, frames=4, shape=(24, 18, 20)):
     spacing = np.full(3, 1e-3)
     origin = -0.5 * spacing * (np.array(shape[::-1]) - 1)
     grid = geometry.Grid(origin=origin, spacing=spacing, shape=shape)
-    z, y, x = np.meshgrid(
-        *(origin[2 - a] + spacing[2 - a] * np.arange(shape[a]) for a in range(3)), indexing="ij"
-    )
+    z, y, x = np.meshgrid(*(origin[2 - a] + spacing[2 - a] * np.arange(shape[a]) for a in range(3)), indexing="ij")
     velocity = np.repeat(np.stack(field(x, y, z)).astype(np.float32)[None], frames, 0)
     mask = np.zeros((frames, *shape), bool)
     mask[:, 1:-1, 1:-1, 1:-1] = True

@@ -47,9 +47,12 @@ def test_whole_node_motion_in_space_and_in_a_plane(library):
     step = node_speed(packet((0.0,) * 3, grid=cube(4)), 1)
     for velocity, scene, points in (
         ((step, 0.0, -step), packet((step, 0.0, -step), 1, grid=cube(12)), lattice(half=1)),
-        ((-step, step), packet((-step, step), 1, grid=cube(20, (0.0, 20e-3)), beams=Beams((0.0, 1.0))),
-         lattice((0.0, 20e-3), 1)),
-    ):  # fmt: skip
+        (
+            (-step, step),
+            packet((-step, step), 1, grid=cube(20, (0.0, 20e-3)), beams=Beams((0.0, 1.0))),
+            lattice((0.0, 20e-3), 1),
+        ),
+    ):
         tracker: Tracker = LibraryTracker(library)
         found = tracker.track(scene, points)
         assert found.velocity.shape == (len(points), len(velocity))

@@ -54,8 +54,12 @@ def test_thinned_cells_are_refilled_and_crowded_ones_thinned():
     cloud = seed_cloud(BOX, flow, 0.0, DENSITY, generator)
     hole = cloud.position.norm(dim=1) < 2.5e-3
     kept = Cloud(*(part[~hole] for part in (cloud.position, cloud.amplitude, cloud.tissue)))
-    doubled = Cloud(*(torch.cat([part, part[:0], part[cloud.position[:, 0] > 3e-3]])
-                      for part in (cloud.position, cloud.amplitude, cloud.tissue)))  # fmt: skip
+    doubled = Cloud(
+        *(
+            torch.cat([part, part[:0], part[cloud.position[:, 0] > 3e-3]])
+            for part in (cloud.position, cloud.amplitude, cloud.tissue)
+        )
+    )
     mean = DENSITY * BOX.volume
     for broken in (kept, doubled):
         assert abs(len(broken.position) - mean) > 0.05 * mean

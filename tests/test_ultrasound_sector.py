@@ -63,9 +63,7 @@ def test_a_point_is_as_wide_across_as_it_is_deep_and_always_as_long(depth):
     across, wide = beam.flip(0) * torch.tensor([1.0, -1.0]), 0.05 * depth / float(beam[1])
     for direction, width in ((beam, 0.5e-3), (across, wide)):
         for side in (-0.5, 0.5):
-            inner, outer = (
-                float(lone_echo(point, point + share * side * width * direction)) for share in (0.95, 1.05)
-            )
+            inner, outer = (float(lone_echo(point, point + share * side * width * direction)) for share in (0.95, 1.05))
             assert outer < 0.5 < inner and inner - outer < 0.1
 
 

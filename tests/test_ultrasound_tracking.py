@@ -41,8 +41,7 @@ def test_a_moving_mirror_of_the_scene_mirrors_the_velocity():
     mirrored = scene.with_iq(scene.iq.flip(-1), noise=scene.noise)
     points = lattice()
     there, here = (
-        PLAIN.track(p, q).velocity
-        for p, q in ((scene, points), (mirrored, points * torch.tensor([-1, 1, 1])))
+        PLAIN.track(p, q).velocity for p, q in ((scene, points), (mirrored, points * torch.tensor([-1, 1, 1])))
     )
     torch.testing.assert_close(there[:, 0], -here[:, 0], atol=1e-4, rtol=0)
     torch.testing.assert_close(there[:, 1:], here[:, 1:], atol=1e-4, rtol=0)
@@ -93,9 +92,7 @@ def test_following_shear_halves_its_error():
         off = []
         for seed in range(2):
             found = tracker.track(packet((0.2, 0.1, 0.2), seed, gradient=gradient), points)
-            true = torch.tensor([0.2, 0.1, 0.2]) + torch.outer(
-                points[:, 0].float(), torch.tensor([0, 0, 150.0])
-            )
+            true = torch.tensor([0.2, 0.1, 0.2]) + torch.outer(points[:, 0].float(), torch.tensor([0, 0, 150.0]))
             off.append((found.velocity - true)[:, 0].abs())
         error[follow] = float(torch.cat(off).median())
     assert error[True] < 0.5 * error[False]
@@ -227,9 +224,7 @@ def test_nan_spoils_its_neighbourhood_alone():
 def test_a_volume_smaller_than_the_kernel_is_flagged_not_fatal():
     grid = Grid((0.0, 0.0, 24e-3), (STEP,) * 3, (9, 2, 9))
     iq = torch.view_as_complex(torch.randn((16, *grid.shape, 2), generator=torch.Generator().manual_seed(0)))
-    found = PLAIN.track(
-        Packet(iq, grid, Acquisition(), Beams()), torch.tensor([[4 * STEP, 0.0, 24e-3 + 4 * STEP]])
-    )
+    found = PLAIN.track(Packet(iq, grid, Acquisition(), Beams()), torch.tensor([[4 * STEP, 0.0, 24e-3 + 4 * STEP]]))
     assert flagged(found, Flag.SAMPLES).all()
 
 

@@ -24,9 +24,11 @@ def settled(name, across, time, **changes):
     surface = container(name, 1 / across)
     height = float(np.ptp(surface.vertices[:, 2]))
     scene = Scene(
-        spacing=1 / across, fluid=Fluid(1.0, 0.05), walls=geometry.WallMotion.at_rest(surface),
+        spacing=1 / across,
+        fluid=Fluid(1.0, 0.05),
+        walls=geometry.WallMotion.at_rest(surface),
         gravity=(0.0, 0.0, -GRAVITY),
-    )  # fmt: skip
+    )
     scheme = WeaklyCompressible(**({"sound_speed": 10.0} | changes))
     run = Simulator(scene, scheme).start(0.0)
     run.advance(time)

@@ -32,9 +32,7 @@ def patch(count, *, dtype=torch.float64, backend="auto", **options):
     block = resting_block(simulator, (-0.5, -0.5), (0.5, 0.5))
     x, y = (block.position / count).unbind(1)
     pressure = patch_pressure(x.double().numpy(), y.double().numpy())
-    start = block.changed(
-        velocity=torch.stack([y, -x], 1), deviation=torch.from_numpy(pressure / SOUND**2).to(dtype)
-    )
+    start = block.changed(velocity=torch.stack([y, -x], 1), deviation=torch.from_numpy(pressure / SOUND**2).to(dtype))
     return simulator.resume(start, 0.0)
 
 
@@ -106,9 +104,13 @@ def on_a_wedge(dtype, backend, wall, spacing=0.05):
     corners = np.concatenate([[[0.0, 0.0]], WEDGE, [[2.0, 0.0], [2.0, 2.5], [0.0, 2.5]]])
     surface = geometry.polygon(corners, spacing)
     scene = Scene(
-        spacing=spacing, fluid=Fluid(1000.0, 0.001), dimension=2, gravity=(0.0, -9.81), reference_speed=5.0,
+        spacing=spacing,
+        fluid=Fluid(1000.0, 0.001),
+        dimension=2,
+        gravity=(0.0, -9.81),
+        reference_speed=5.0,
         walls=geometry.WallMotion.at_rest(surface),
-    )  # fmt: skip
+    )
     options = FREE_SURFACE_OPTIONS | {"sound_speed": 30.0, "wall": wall}
     simulator = Simulator(scene, WeaklyCompressible(**options), dtype=dtype, backend=backend)
     return simulator.resume(resting_block(simulator, (0.6, 0.8), (1.4, 1.6)), 0.0)
@@ -165,9 +167,13 @@ def test_pressure_probes():
     spacing = 0.05
     surface = geometry.polygon(np.array([[0, 0], [1, 0], [1, 2], [0, 2]], np.float64), spacing)
     scene = Scene(
-        spacing=spacing, fluid=Fluid(1000.0, 10.0), dimension=2, gravity=(0.0, -9.81), reference_speed=4.0,
+        spacing=spacing,
+        fluid=Fluid(1000.0, 10.0),
+        dimension=2,
+        gravity=(0.0, -9.81),
+        reference_speed=4.0,
         walls=geometry.WallMotion.at_rest(surface),
-    )  # fmt: skip
+    )
     simulator = Simulator(scene, WeaklyCompressible(**(FREE_SURFACE_OPTIONS | {"sound_speed": 40.0})))
     block = resting_block(simulator, (0.0, 0.0), (1.0, 1.0))
     depth = 1.0 - block.position[:, 1] * spacing

@@ -16,9 +16,12 @@ def column(**changes):
     size, spacing = 1.0, 0.05
     surface = geometry.polygon(size * np.array([[0, 0], [1, 0], [1, 1], [0, 1.0]]), spacing)
     scene = Scene(
-        spacing=spacing, fluid=Fluid(1.0, 0.05), walls=geometry.WallMotion.at_rest(surface),
-        gravity=(0.0, -GRAVITY), dimension=2,
-    )  # fmt: skip
+        spacing=spacing,
+        fluid=Fluid(1.0, 0.05),
+        walls=geometry.WallMotion.at_rest(surface),
+        gravity=(0.0, -GRAVITY),
+        dimension=2,
+    )
     scheme = WeaklyCompressible(**({"sound_speed": 10.0, "smoothing_ratio": 2.0} | changes))
     run = Simulator(scene, scheme, dtype=torch.float64).start(0.0)
     run.advance(3.0)

@@ -44,9 +44,7 @@ def test_order_of_convergence():
 
 def test_the_thesis_wall_is_far_from_it():
     """The potential wall on the same flow, from the steady profile: 7 %, and the flow goes on slowing down."""
-    run = pipe(
-        16, VISCOSITY, (0.0, 0.0, FORCE), wall=PotentialWall(), shifting=0.5, shifting_speed="local"
-    )
+    run = pipe(16, VISCOSITY, (0.0, 0.0, FORCE), wall=PotentialWall(), shifting=0.5, shifting_speed="local")
     fill_with(run, validation_walls.pipe_flow(axis_distance(run), VISCOSITY, FORCE, RADIUS))
     run.advance(0.5)
     exact = validation_walls.pipe_flow(axis_distance(run), VISCOSITY, FORCE, RADIUS)

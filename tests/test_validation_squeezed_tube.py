@@ -26,9 +26,12 @@ def squeezed(name, rate, pressure=None):
         times, places, tube.faces, np.where(at_end, END, 0).astype(np.uint8), rates=places * np.array([rate, rate, 0.0])
     )
     scene = Scene(
-        spacing=SPACING, fluid=Fluid(1000.0, 0.0), walls=walls, reference_speed=0.2,
+        spacing=SPACING,
+        fluid=Fluid(1000.0, 0.0),
+        walls=walls,
+        reference_speed=0.2,
         valves=(Valve(END, ((0.0, 1.0),), pressure=pressure),),
-    )  # fmt: skip
+    )
     run = Simulator(scene, preset(name, wall=CompleteKernelWall(no_slip=False))).start(0.0)
 
     def exact():
@@ -68,8 +71,12 @@ def test_a_widened_tube_is_filled_as_it_must(name):
 
 @pytest.mark.parametrize(
     ("name", "rate", "bound"),
-    [("projection", -4.0, 0.06), ("weakly_compressible", -4.0, 0.08), ("projection", 4.0, 0.08),
-     ("weakly_compressible", 4.0, 0.12)],
+    [
+        ("projection", -4.0, 0.06),
+        ("weakly_compressible", -4.0, 0.08),
+        ("projection", 4.0, 0.08),
+        ("weakly_compressible", 4.0, 0.12),
+    ],
 )
 def test_an_end_at_a_given_pressure_passes_what_the_volume_demands(name, rate, bound):
     """Nothing but the walls drives the flow, and it is as exact as with a prescribed flux, or more so.

@@ -74,7 +74,7 @@ def test_buffer_carries_the_flux_and_keeps_an_imposed_profile(recording, scene):
     mask = torch.from_numpy(np.ascontiguousarray(recording.mask[30]))
     nodes = recording.grid.nodes()
     centre = torch.tensor([*VENTRICLE.mitral_centre, 0.0])
-    profile = -torch.exp(-((nodes - centre)[:, :2].norm(dim=1) / 2e-3) ** 2).reshape(recording.grid.shape)
+    profile = -torch.exp(-(((nodes - centre)[:, :2].norm(dim=1) / 2e-3) ** 2)).reshape(recording.grid.shape)
     field = torch.zeros(3, *recording.grid.shape)
     field[2] = profile
     run.impose(recording.grid, field, mask)

@@ -60,9 +60,7 @@ def test_no_particle_is_left_behind_by_it():
     run = Simulator(Scene(spacing=spacing, walls=motion)).start(0.15)
     run.advance(0.27)
     surface = motion.surface(0.27)
-    inside = geometry.winding_number(
-        surface.vertices, surface.faces, run.particles.position.double().numpy() * spacing
-    )
+    inside = geometry.winding_number(surface.vertices, surface.faces, run.particles.position.double().numpy() * spacing)
     assert (inside > 0.5).all()
     assert int(run.record.outside) == 0 and not bool(run.record.failed)
 

@@ -20,9 +20,9 @@ def half_space_share(distance, h):
     support = WENDLAND.support * h
     x = torch.linspace(-support, support, 2001, dtype=torch.float64)
     radius = torch.linspace(0, support, 2001, dtype=torch.float64)
-    slices = torch.stack([
-        torch.trapezoid(WENDLAND.value((radius**2 + s**2).sqrt(), h, 3) * 2 * torch.pi * radius, radius) for s in x
-    ])
+    slices = torch.stack(
+        [torch.trapezoid(WENDLAND.value((radius**2 + s**2).sqrt(), h, 3) * 2 * torch.pi * radius, radius) for s in x]
+    )
     keep = (x < distance).to(torch.float64)
     return float(torch.trapezoid(slices * keep, x)), float(np.interp(distance, x.numpy(), slices.numpy()))
 
@@ -135,8 +135,10 @@ def test_an_open_orifice_is_no_wall():
     assert float(made.sample(made.between(opened, opened), zero, centre).distance) > 1.5
     assert float(made.sample(made.between(shut, shut), zero, above).distance) < 0
     assert float(made.sample(made.between(opened, opened), zero, above).distance) > 1.5
-    assert float(made.sample(made.between(opened, opened), zero, centre).share) > 0.9 > float(
-        made.sample(made.between(shut, shut), zero, centre).share
+    assert (
+        float(made.sample(made.between(opened, opened), zero, centre).share)
+        > 0.9
+        > float(made.sample(made.between(shut, shut), zero, centre).share)
     )
 
 

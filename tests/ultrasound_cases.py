@@ -25,6 +25,4 @@ def packet(velocity, seed=0, *, grid=None, gradient=None, dtype=torch.float32, *
     grid = grid or cube()
     centre = tuple(0.5 * (a + b) for a, b in zip(grid.origin, grid.upper, strict=True))
     flow = LinearFlow(tuple(velocity), gradient, centre)
-    return simulate_packet(
-        flow, grid, EchoModel(**model), 0.0, torch.Generator().manual_seed(seed), dtype=dtype
-    )
+    return simulate_packet(flow, grid, EchoModel(**model), 0.0, torch.Generator().manual_seed(seed), dtype=dtype)

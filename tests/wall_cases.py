@@ -18,9 +18,12 @@ def pipe(across, viscosity, gravity, length=10, dtype=torch.float32, **changes):
     tube = geometry.tube(RADIUS, (length + 14) * spacing, 0.5 * spacing)
     tube = tube.moved(tube.vertices - np.array([0, 0, 7 * spacing]))
     scene = Scene(
-        spacing=spacing, fluid=Fluid(1.0, viscosity), walls=geometry.WallMotion.at_rest(tube),
-        period=(None, None, length * spacing), gravity=gravity,
-    )  # fmt: skip
+        spacing=spacing,
+        fluid=Fluid(1.0, viscosity),
+        walls=geometry.WallMotion.at_rest(tube),
+        period=(None, None, length * spacing),
+        gravity=gravity,
+    )
     scheme = WeaklyCompressible(**(validation_walls.CURVED_WALL_OPTIONS | changes))
     return Simulator(scene, scheme, dtype=dtype).start(0.0)
 

@@ -25,13 +25,9 @@ class Parser(argparse.ArgumentParser):
         self.exit(2, f"{self.prog}: error: {' '.join(message.split())} (see {self.prog} --help)\n")
 
 
-def build_parser(
-    commands: dict[str, Callable[[argparse.Namespace], None]], presets: tuple[str, ...]
-) -> Parser:
+def build_parser(commands: dict[str, Callable[[argparse.Namespace], None]], presets: tuple[str, ...]) -> Parser:
     """The parser of `torchsph`; `commands` maps each name to what runs it."""
-    parser = Parser(
-        prog="torchsph", description="Flow in the heart from noisy ultrasound velocity recordings."
-    )
+    parser = Parser(prog="torchsph", description="Flow in the heart from noisy ultrasound velocity recordings.")
     parser.add_argument("--version", action="version", version=f"torchsph {__version__}")
     subparsers = parser.add_subparsers(title="commands", metavar="COMMAND", dest="command", required=True)
     for name, describe in (
@@ -54,9 +50,7 @@ def _assimilate(parser: Parser, presets: tuple[str, ...]) -> None:
     Without a file, every method runs on the sample that ships with the package; with a file and no --method,
     the default method alone.
     """
-    parser.add_argument(
-        "measurement", nargs="?", metavar="MEASUREMENT.h5", help="a recording with /weight or /sigma"
-    )
+    parser.add_argument("measurement", nargs="?", metavar="MEASUREMENT.h5", help="a recording with /weight or /sigma")
     parser.add_argument("--truth", metavar="TRUTH.h5", help="the true flow, to compute errors against")
     parser.add_argument("--method", type=names, metavar="NAME[,NAME]", help="free, spline, sph, ensemble")
     parser.add_argument(
@@ -71,12 +65,8 @@ def _assimilate(parser: Parser, presets: tuple[str, ...]) -> None:
     parser.add_argument(
         "--lag", type=whole(1), metavar="N", help="frames whose data still move the ensemble's earlier analyses (off)"
     )
-    parser.add_argument(
-        "--resume", action="store_true", help="go on with the ensemble where DIR/checkpoint.pt left it"
-    )
-    parser.add_argument(
-        "--seed", type=whole(0), default=0, metavar="S", help="of everything random (%(default)s)"
-    )
+    parser.add_argument("--resume", action="store_true", help="go on with the ensemble where DIR/checkpoint.pt left it")
+    parser.add_argument("--seed", type=whole(0), default=0, metavar="S", help="of everything random (%(default)s)")
     _out(parser)
 
 
@@ -93,12 +83,8 @@ def _forecast(parser: Parser, presets: tuple[str, ...]) -> None:
         "--every", type=whole(1), default=1, metavar="K", help="start from each K-th frame (%(default)s)"
     )
     _model(parser, presets)
-    parser.add_argument(
-        "--seed", type=whole(0), default=0, metavar="S", help="of everything random (%(default)s)"
-    )
-    parser.add_argument(
-        "--save", action="store_true", help="also write the forecasts, one recording for each lead"
-    )
+    parser.add_argument("--seed", type=whole(0), default=0, metavar="S", help="of everything random (%(default)s)")
+    parser.add_argument("--save", action="store_true", help="also write the forecasts, one recording for each lead")
     _out(parser)
 
 
@@ -116,9 +102,7 @@ def _measure(parser: Parser, _: tuple[str, ...]) -> None:
     noise = parser.add_argument_group("noise")
     noise.add_argument("--lateral", type=number(0), metavar="S", help="noise across the beam, m/s")
     noise.add_argument("--axial", type=number(0), metavar="S", help="noise along the beam, m/s")
-    noise.add_argument(
-        "--outliers", type=number(0, 1), metavar="P", help="share of nodes that hop to a false peak"
-    )
+    noise.add_argument("--outliers", type=number(0, 1), metavar="P", help="share of nodes that hop to a false peak")
     echoes = parser.add_argument_group("speckle, doppler")
     echoes.add_argument("--snr", type=number(-100), metavar="DB", help="of the blood's echoes")
     echoes.add_argument("--prf", type=number(0, open_below=True), metavar="HZ", help="pulses per second")
@@ -127,9 +111,7 @@ def _measure(parser: Parser, _: tuple[str, ...]) -> None:
         "--apex", type=float, nargs="+", metavar="M", help="x, y, z: beams fan out from there; else parallel"
     )
     echoes.add_argument("--clutter", type=number(0), metavar="DB", help="tissue over blood inside the cavity")
-    parser.add_argument(
-        "--seed", type=whole(0), default=0, metavar="N", help="of everything random (%(default)s)"
-    )
+    parser.add_argument("--seed", type=whole(0), default=0, metavar="N", help="of everything random (%(default)s)")
 
 
 def _smooth(parser: Parser, _: tuple[str, ...]) -> None:
@@ -174,9 +156,7 @@ def whole(least: int) -> Callable[[str], int]:
 
 def number(low: float, high: float = math.inf, open_below: bool = False) -> Callable[[str], float]:
     """A finite number from `low` (itself excluded where `open_below`) to `high`."""
-    rule = f"{'above' if open_below else 'at least'} {low:g}" + (
-        "" if math.isinf(high) else f" and at most {high:g}"
-    )
+    rule = f"{'above' if open_below else 'at least'} {low:g}" + ("" if math.isinf(high) else f" and at most {high:g}")
 
     def convert(text: str) -> float:
         try:

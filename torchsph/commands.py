@@ -81,16 +81,16 @@ def assimilate(args: argparse.Namespace) -> None:
     _print_table(report.scores_table(scores, seconds))
     for words in results["ensemble"].info["filter"]["warnings"] if "ensemble" in results else ():
         _say(f"ensemble: {words}")
-    _say(f"wrote {', '.join(f'{name}.h5' for name in analyses)}, analysis.h5 (= {chosen}.h5), report.png and "
-         f"metrics.json to {folder}/")  # fmt: skip
+    _say(
+        f"wrote {', '.join(f'{name}.h5' for name in analyses)}, analysis.h5 (= {chosen}.h5), report.png and "
+        f"metrics.json to {folder}/"
+    )
 
 
 def _assimilate_inputs(args: argparse.Namespace) -> tuple[Path, Path | None, tuple[str, ...]]:
     if args.measurement is None:
         if args.truth is not None:
-            raise ValueError(
-                "--truth needs MEASUREMENT.h5 (without it the sample runs, which has its own truth)"
-            )
+            raise ValueError("--truth needs MEASUREMENT.h5 (without it the sample runs, which has its own truth)")
         inputs = data.sample_measurement(), data.sample_truth()
         methods = args.method or tuple(pipeline.METHODS)
     else:
@@ -142,9 +142,7 @@ def forecast(args: argparse.Namespace) -> None:
         for lead, saved in skill.recordings.items():
             geometry.write_recording(scratch / f"forecast_{1e3 * lead:g}ms.h5", saved)
         report.draw_forecast(scratch / "forecast.png", skill.leads)
-        write_json(
-            scratch / "metrics.json", {"leads": skill.leads, "seconds": skill.seconds, "config": config}
-        )
+        write_json(scratch / "metrics.json", {"leads": skill.leads, "seconds": skill.seconds, "config": config})
     rows = [["lead ms", "starts", "model", "persistence"]]
     for row in skill.leads:
         errors = [f"{row['nrmse'][name]:.3f}" for name in ("model", "persistence")]
@@ -153,9 +151,7 @@ def forecast(args: argparse.Namespace) -> None:
     _say(f"wrote forecast.png, metrics.json{' and the forecasts' if args.save else ''} to {folder}/")
 
 
-def _leads_within(
-    leads: Sequence[float] | None, recording: geometry.Recording, every: int
-) -> tuple[float, ...]:
+def _leads_within(leads: Sequence[float] | None, recording: geometry.Recording, every: int) -> tuple[float, ...]:
     """The leads at which a start has a later frame to compare with; one that was asked for must have it."""
     time = np.asarray(recording.time)
     later = time[None, :] - time[::every, None]
@@ -203,9 +199,7 @@ def smooth(args: argparse.Namespace) -> None:
     measured = _full_vectors(geometry.read_recording(args.measurement), args.measurement)
     smoothed = smooth_recording(measured, progress=True)
     geometry.write_recording(path, smoothed)
-    scores = {
-        name: metrics.evaluate(one, None, measured) for name, one in (("raw", measured), ("spline", smoothed))
-    }
+    scores = {name: metrics.evaluate(one, None, measured) for name, one in (("raw", measured), ("spline", smoothed))}
     _print_table(report.scores_table(scores, {}))
     _say(f"wrote {len(smoothed.time)} frames to {path}")
 
@@ -232,9 +226,7 @@ def summary_table(recording: geometry.Recording) -> list[list[str]]:
     """What a recording holds, as rows of name and value."""
     time, grid, wall = np.asarray(recording.time), recording.grid, recording.wall
     speed = np.linalg.norm(metrics.filled_velocity(recording), axis=1)[np.asarray(recording.mask, bool)]
-    regions = {
-        int(label): int(n) for label, n in zip(*np.unique(wall.region, return_counts=True), strict=True)
-    }
+    regions = {int(label): int(n) for label, n in zip(*np.unique(wall.region, return_counts=True), strict=True)}
     intervals = recording.valve_intervals_or_derived()
     optional = ("weight", "sigma", "uncovered", "beam", "pressure", "volume", "flux_mitral", "flux_aortic")
     present = [name for name in optional if getattr(recording, name) is not None]
@@ -283,9 +275,7 @@ def _device(name: str) -> str:
     if device.type not in ("cpu", "cuda"):
         raise ValueError(f"--device: '{name}' is not supported; use cpu, cuda or cuda:N")
     if device.type == "cuda" and (device.index or 0) >= torch.cuda.device_count():
-        raise ValueError(
-            f"--device: this machine has no '{name}' that torch {torch.__version__} can use; use cpu"
-        )
+        raise ValueError(f"--device: this machine has no '{name}' that torch {torch.__version__} can use; use cpu")
     return name
 
 
@@ -310,9 +300,7 @@ def _output_file(name: str) -> Path:
 
 
 def _config(args: argparse.Namespace, **extra: Any) -> dict[str, Any]:
-    options = {
-        name: value for name, value in vars(args).items() if name not in ("run", "measurement", "method")
-    }
+    options = {name: value for name, value in vars(args).items() if name not in ("run", "measurement", "method")}
     return {"torchsph": __version__, "torch": torch.__version__, **options, **extra}
 
 

@@ -51,8 +51,17 @@ class Cycle:
     """
 
     def __init__(
-        self, sources: Sequence[Source], splines: FrameSmoother, forecaster: Forecaster, filter_: Filter,
-        options: EnsembleOptions, *, members: int, usual: float, truth: geometry.Recording | None = None, seed: int = 0,
+        self,
+        sources: Sequence[Source],
+        splines: FrameSmoother,
+        forecaster: Forecaster,
+        filter_: Filter,
+        options: EnsembleOptions,
+        *,
+        members: int,
+        usual: float,
+        truth: geometry.Recording | None = None,
+        seed: int = 0,
     ) -> None:
         self.sources, self.splines, self.forecaster = list(sources), splines, forecaster
         self.filter, self.options, self.count, self.usual = filter_, options, members, usual
@@ -106,7 +115,8 @@ class Cycle:
         early, late = self.mask(frame - 1), self.mask(frame)
         seen = [
             (source, source.see(number), float(source.recording.time[number]))
-            for source in self.sources for number in source.frames_within(before, now)
+            for source in self.sources
+            for number in source.frames_within(before, now)
         ]
         times = sorted({time for _, _, time in seen if time < now - 1e-6}) + [now]
         masks = [early | late] * (len(times) - 1) + [late]
@@ -130,7 +140,11 @@ class Cycle:
         if length is None:
             length = max(fwhm_to_deviation(self.sources[0].kernel), float(np.mean(self.grid.spacing)))
         return flow_perturbations(
-            self.count, np.array(self.measured.mask[frame], bool), self.grid.spacing, amplitude, length,
+            self.count,
+            np.array(self.measured.mask[frame], bool),
+            self.grid.spacing,
+            amplitude,
+            length,
             generator or self.generator,
         ).to(torch.float32)
 
@@ -172,16 +186,17 @@ class Cycle:
 
     # --- observations ---------------------------------------------------------------------------------
 
-    def _look(
-        self, parts: list[tuple[Source, Seen, int]], states: list[Ensemble], masks: list[Tensor]
-    ) -> Look | None:
+    def _look(self, parts: list[tuple[Source, Seen, int]], states: list[Ensemble], masks: list[Tensor]) -> Look | None:
         parts = [part for part in parts if len(part[1].position)]
         if not parts:
             return None
-        group = torch.cat([
-            torch.arange(seen.parts).repeat_interleave(len(seen.position))
-            + self.first_group[self.sources.index(source)] for source, seen, _ in parts
-        ])  # fmt: skip
+        group = torch.cat(
+            [
+                torch.arange(seen.parts).repeat_interleave(len(seen.position))
+                + self.first_group[self.sources.index(source)]
+                for source, seen, _ in parts
+            ]
+        )
         observations = self.scale.apply(concatenate([seen.observations for _, seen, _ in parts]), group)
         members = torch.cat([source.predict(states[k].members, masks[k], seen) for source, seen, k in parts], 1)
         return Look(parts, observations, group, members)
@@ -190,18 +205,19 @@ class Cycle:
         surface = self.splines.motion.surface(float(self.measured.time[frame]))
         speed = control.norm(dim=0)[None]
         found = [
-            {name: mask.repeat(seen.parts) for name, mask in flow_regions(
-                surface, seen.position, self.grid.sample(speed, seen.position)[0], float(min(self.grid.spacing))
-            ).items()}
+            {
+                name: mask.repeat(seen.parts)
+                for name, mask in flow_regions(
+                    surface, seen.position, self.grid.sample(speed, seen.position)[0], float(min(self.grid.spacing))
+                ).items()
+            }
             for _, seen, _ in parts
         ]
         return {name: torch.cat([one[name] for one in found]) for name in found[0]}
 
     # --- analysis -------------------------------------------------------------------------------------
 
-    def _analyse(
-        self, states: list[Ensemble], masks: list[Tensor], look: Look, frame: int, missing: int
-    ) -> None:
+    def _analyse(self, states: list[Ensemble], masks: list[Tensor], look: Look, frame: int, missing: int) -> None:
         mask, state = masks[-1], states[-1]
         inside = torch.nonzero(mask.flatten()).squeeze(1)
         forecast = state.members.flatten(2)[:, :, inside].flatten(1)
@@ -247,7 +263,13 @@ class Cycle:
         return self.spline.of(values, weight, look, frame), self.spline.state()
 
     def _filtered(
-        self, joint: Tensor, look: Look, positions: Tensor, control: Tensor, frame: int, inside: Tensor,
+        self,
+        joint: Tensor,
+        look: Look,
+        positions: Tensor,
+        control: Tensor,
+        frame: int,
+        inside: Tensor,
         generator: torch.Generator,
     ) -> tuple[Analysis, dict[str, Tensor], list[Lagged]]:
         """The filter's analysis, without its map of the members, which is large and has served; regions; the past."""
@@ -273,9 +295,7 @@ class Cycle:
             torch.cat([source.predict(fields, masks[k], seen) for source, seen, k in look.parts], 1)
         )
 
-    def _increments(
-        self, analysis: Analysis, found: Tensor, inside: Tensor, control: Tensor, frame: int
-    ) -> Tensor:
+    def _increments(self, analysis: Analysis, found: Tensor, inside: Tensor, control: Tensor, frame: int) -> Tensor:
         """(J, D, *shape) increments, each with one component alone, in the order of ``options.increments``."""
         parts = self.grid.dimension
         offered = []
@@ -289,9 +309,7 @@ class Cycle:
             offered.append(torch.diag_embed(whole.movedim(0, -1)).movedim((-2, -1), (0, 1)))
         return torch.cat(offered)
 
-    def _match_spread(
-        self, masks: list[Tensor], look: Look, used: Tensor, drawn: Tensor, found: Tensor
-    ) -> None:
+    def _match_spread(self, masks: list[Tensor], look: Look, used: Tensor, drawn: Tensor, found: Tensor) -> None:
         """Compare what splines (1 + k, D, *shape) find in the innovations and in draws from the ensemble (k, m).
 
         Every observation in use counts alike: the spread stands for the error of the whole state, most of which lies
@@ -321,8 +339,12 @@ class Cycle:
             if gaps.min() < 1e-6:
                 right = torch.from_numpy(self.truth.velocity[int(gaps.argmin())]).flatten(1)[:, inside].flatten()
         self.record.add(
-            time, analysis, look.observations, regions=look.regions,
-            forecast=None if right is None else forecast, truth=right,
+            time,
+            analysis,
+            look.observations,
+            regions=look.regions,
+            forecast=None if right is None else forecast,
+            truth=right,
         )
         if not bool(torch.isin(analysis.reason, torch.tensor([Reason.USED, Reason.OUT_OF_REACH])).any()):
             self.events.append({"time": time, "coasted": True})
@@ -357,14 +379,25 @@ class Cycle:
     def state(self) -> dict[str, Any]:
         """Everything that the next step depends on, as tensors and plain values."""
         return {
-            "ensemble": {"control": self.ensemble.control, "members": self.ensemble.members,
-                         "parameters": dict(self.ensemble.parameters)},
-            "generator": self.generator.get_state(), "gain": self.gain.state(), "spread": self.spread.state(),
-            "scale": self.scale.state(), "record": self.record.state(), "spline": self.spline.state(),
-            "offered": self.offered, "fields": list(self.fields), "sigmas": list(self.sigmas),
-            "missing": list(self.missing), "events": list(self.events), "shocks": list(self.shocks),
+            "ensemble": {
+                "control": self.ensemble.control,
+                "members": self.ensemble.members,
+                "parameters": dict(self.ensemble.parameters),
+            },
+            "generator": self.generator.get_state(),
+            "gain": self.gain.state(),
+            "spread": self.spread.state(),
+            "scale": self.scale.state(),
+            "record": self.record.state(),
+            "spline": self.spline.state(),
+            "offered": self.offered,
+            "fields": list(self.fields),
+            "sigmas": list(self.sigmas),
+            "missing": list(self.missing),
+            "events": list(self.events),
+            "shocks": list(self.shocks),
             "lagged": [] if self.lagged is None else self.lagged.state(),
-        }  # fmt: skip
+        }
 
     def restore(self, state: dict[str, Any]) -> None:
         self.ensemble = Ensemble(**state["ensemble"])

@@ -18,14 +18,18 @@ from .validation import FREE_SURFACE_OPTIONS
 GRAVITY = 9.81  # m/s^2
 
 # Column of width a and height 2 a: surge front x / a (second row) at t sqrt(2 g / a) (first row), dry bed
-MARTIN_MOYCE_1952 = np.array([
-    [0.849, 1.212, 1.602, 2.283, 2.95, 3.598, 3.905, 4.592, 4.961, 5.316],
-    [1.245, 1.443, 1.884, 2.689, 3.728, 4.528, 4.999, 5.841, 6.271, 6.717],
-])  # fmt: skip
-KOSHIZUKA_OKA_1996 = np.array([
-    [0.0, 0.381, 0.769, 1.153, 1.537, 1.935, 2.323, 2.719, 3.096],
-    [1.0, 1.111, 1.252, 1.505, 1.892, 2.241, 2.615, 3.003, 3.624],
-])  # fmt: skip
+MARTIN_MOYCE_1952 = np.array(
+    [
+        [0.849, 1.212, 1.602, 2.283, 2.95, 3.598, 3.905, 4.592, 4.961, 5.316],
+        [1.245, 1.443, 1.884, 2.689, 3.728, 4.528, 4.999, 5.841, 6.271, 6.717],
+    ]
+)
+KOSHIZUKA_OKA_1996 = np.array(
+    [
+        [0.0, 0.381, 0.769, 1.153, 1.537, 1.935, 2.323, 2.719, 3.096],
+        [1.0, 1.111, 1.252, 1.505, 1.892, 2.241, 2.615, 3.003, 3.624],
+    ]
+)
 
 # SPHERIC test 2 (Kleefsman et al. 2005 section 6): tank, column, obstacle (lower and upper corner), probes P1, P3; m.
 OBSTACLE_TANK = ((0.0, -0.5, 0.0), (3.22, 0.5, 1.0))
@@ -44,10 +48,13 @@ def column_scene(spacing: float, width: float = 1.0, *, viscosity: float = 0.001
     """
     corners = 4.0 * width * np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float64)
     return Scene(
-        spacing=spacing, fluid=Fluid(1000.0, viscosity), dimension=2, gravity=(0.0, -GRAVITY),
+        spacing=spacing,
+        fluid=Fluid(1000.0, viscosity),
+        dimension=2,
+        gravity=(0.0, -GRAVITY),
         walls=geometry.WallMotion.at_rest(geometry.polygon(corners, spacing)),
         reference_speed=math.sqrt(2 * GRAVITY * 2 * width),
-    )  # fmt: skip
+    )
 
 
 def obstacle_scene(spacing: float) -> Scene:
@@ -64,9 +71,12 @@ def obstacle_scene(spacing: float) -> Scene:
         np.concatenate([tank.faces, inward + len(tank.vertices)]),
     )
     return Scene(
-        spacing=spacing, fluid=Fluid(1000.0, 0.001), gravity=(0.0, 0.0, -GRAVITY),
-        walls=geometry.WallMotion.at_rest(walls), reference_speed=math.sqrt(2 * GRAVITY * OBSTACLE_COLUMN[1][2]),
-    )  # fmt: skip
+        spacing=spacing,
+        fluid=Fluid(1000.0, 0.001),
+        gravity=(0.0, 0.0, -GRAVITY),
+        walls=geometry.WallMotion.at_rest(walls),
+        reference_speed=math.sqrt(2 * GRAVITY * OBSTACLE_COLUMN[1][2]),
+    )
 
 
 def obstacle_run(simulator: Simulator) -> Simulation:

@@ -34,9 +34,7 @@ class Domain:
     ``enter`` chooses the key frames and open valves of an interval, ``at`` sets the members' times inside it.
     """
 
-    def __init__(
-        self, scene: Scene, scheme: Scheme, units: Units, device: str, dtype: torch.dtype
-    ) -> None:
+    def __init__(self, scene: Scene, scheme: Scheme, units: Units, device: str, dtype: torch.dtype) -> None:
         self.scene, self.scheme, self.units = scene, scheme, units
         self.device, self.dtype = device, dtype
         smoothing = kernel(scheme.kernel)
@@ -57,7 +55,14 @@ class Domain:
             complete = isinstance(scheme.wall, CompleteKernelWall)
             self._check_periodic_walls()
             self.walls = WallFields(
-                scene.walls, units.length, units.speed, smoothing, scheme.smoothing_ratio, complete, device, dtype,
+                scene.walls,
+                units.length,
+                units.speed,
+                smoothing,
+                scheme.smoothing_ratio,
+                complete,
+                device,
+                dtype,
                 sliding=complete and scheme.wall.sliding,
             )
             self._make_valves()
@@ -128,9 +133,7 @@ class Domain:
         inner = sorted(t for t in times if start + tolerance < t < stop - tolerance)
         return [*inner, stop] if stop > start else []
 
-    def enter(
-        self, start: float, stop: float, *, shut: bool = False, valve_strength: float | Tensor = 1.0
-    ) -> None:
+    def enter(self, start: float, stop: float, *, shut: bool = False, valve_strength: float | Tensor = 1.0) -> None:
         """Choose key frames and open valves for an interval without breaks inside; ``shut`` closes every valve.
 
         ``valve_strength``: of the run that goes through it, a number or (members,).
@@ -269,9 +272,7 @@ class Domain:
             return after
         gap = self.scheme.wall.gap
         # few particles are that close: the rest is for them alone
-        near, distance = near_wall(
-            before.position, after.position, wall, step, after.member, after.fluid, gap
-        )
+        near, distance = near_wall(before.position, after.position, wall, step, after.member, after.fluid, gap)
         if near.numel() == 0:
             return after
         normal = wall.normal[near]
@@ -298,9 +299,7 @@ class Domain:
         return particles.position.index_add(0, row, way[:, None] * wall.normal)
 
     def _wrapped(self, particles: Particles) -> Particles:
-        return particles if self.period is None else particles.changed(
-            position=self.wrapped(particles.position)
-        )
+        return particles if self.period is None else particles.changed(position=self.wrapped(particles.position))
 
     def wrapped(self, position: Tensor) -> Tensor:
         """Points (n, D), internal, brought back into the periodic box."""
@@ -353,18 +352,14 @@ class Domain:
         particles = particles.changed(velocity=self.sampled(particles, grid, field, points))
         return particles if self.reservoirs is None else self.reservoirs.driven(particles, channel=True)
 
-    def sampled(
-        self, particles: Particles, grid: Grid, field: Tensor, position: Tensor | None = None
-    ) -> Tensor:
+    def sampled(self, particles: Particles, grid: Grid, field: Tensor, position: Tensor | None = None) -> Tensor:
         """A grid field (members or 1, D, *shape), m/s, at the particles or at ``position``: (N, D), internal."""
         points = (particles.position if position is None else position) * self.units.length
         field = field.to(self.device, self.dtype)
         field = field if field.ndim == grid.dimension + 2 else field[None]
         if field.shape[0] == 1:
             return grid.sample(field[0], points).T / self.units.speed
-        parts = [
-            grid.sample(field[b], points[particles.member == b]).T for b in range(particles.members)
-        ]
+        parts = [grid.sample(field[b], points[particles.member == b]).T for b in range(particles.members)]
         value = torch.empty_like(particles.velocity)
         for b, part in enumerate(parts):
             value[particles.member == b] = part

@@ -41,18 +41,26 @@ def default_filter(measured: geometry.Recording, options: EnsembleOptions) -> LE
     """Local ensemble transform Kalman filter with RTPS, its radius from the size of the walls."""
     vertices = measured.wall.at(0).vertices
     radius = options.localisation * float(np.ptp(vertices, axis=0).max())
-    return LETKF(
-        localisation=Localisation(radius), inflation=RTPS(options.relaxation), gross_error=options.gross_error
-    )
+    return LETKF(localisation=Localisation(radius), inflation=RTPS(options.relaxation), gross_error=options.gross_error)
 
 
 def assimilate(
-    measured: geometry.Recording, model: Simulator, *, members: int = 16, filter: Filter | None = None,
-    options: EnsembleOptions | None = None, coarse: Simulator | None = None,
-    also: Sequence[geometry.Recording] = (), splines: FrameSmoother | None = None,
-    smoothed: geometry.Recording | None = None, error: ObservationError | None = None,
-    truth: geometry.Recording | None = None, checkpoints: str | Path | None = None, resume: bool = False,
-    seed: int = 0, progress: bool = False,
+    measured: geometry.Recording,
+    model: Simulator,
+    *,
+    members: int = 16,
+    filter: Filter | None = None,
+    options: EnsembleOptions | None = None,
+    coarse: Simulator | None = None,
+    also: Sequence[geometry.Recording] = (),
+    splines: FrameSmoother | None = None,
+    smoothed: geometry.Recording | None = None,
+    error: ObservationError | None = None,
+    truth: geometry.Recording | None = None,
+    checkpoints: str | Path | None = None,
+    resume: bool = False,
+    seed: int = 0,
+    progress: bool = False,
 ) -> EnsembleRun:
     """Assimilate measurements into an ensemble of SPH simulations.
 
@@ -93,8 +101,15 @@ def assimilate(
     sources = [Source(measured, error, measured.grid, options.kernel)]
     sources += [_other(one, measured, options, progress) for one in also]
     cycle = Cycle(
-        sources, splines, Forecaster(model, coarse, measured.grid, options.transfer, batch=options.batch, seed=seed),
-        filter, options, members=members, usual=_usual_speed(measured, splines, smoothed), truth=truth, seed=seed,
+        sources,
+        splines,
+        Forecaster(model, coarse, measured.grid, options.transfer, batch=options.batch, seed=seed),
+        filter,
+        options,
+        members=members,
+        usual=_usual_speed(measured, splines, smoothed),
+        truth=truth,
+        seed=seed,
     )
     key = checkpoint.fingerprint(_identity(measured, also, model, coarse, filter, options, members, seed))
     path = None if checkpoints is None else Path(checkpoints)
@@ -129,9 +144,7 @@ def _other(
     return Source(recording, error, measured.grid, options.kernel)
 
 
-def _usual_speed(
-    measured: geometry.Recording, splines: FrameSmoother, smoothed: geometry.Recording | None
-) -> float:
+def _usual_speed(measured: geometry.Recording, splines: FrameSmoother, smoothed: geometry.Recording | None) -> float:
     """RMS per component of the splines, m/s; without them, of some of the frames'."""
     if smoothed is None:
         chosen = [f for f in range(0, measured.frames, 4) if splines.measures(f)]
@@ -143,8 +156,14 @@ def _usual_speed(
 
 
 def _identity(
-    measured: geometry.Recording, also: Sequence[geometry.Recording], model: Simulator, coarse: Simulator,
-    filter_: Filter, options: EnsembleOptions, members: int, seed: int,
+    measured: geometry.Recording,
+    also: Sequence[geometry.Recording],
+    model: Simulator,
+    coarse: Simulator,
+    filter_: Filter,
+    options: EnsembleOptions,
+    members: int,
+    seed: int,
 ) -> list[object]:
     """What must be the same for a run to go on where another stopped."""
     simulators = [(one.scene.spacing, one.scheme, one.dtype, one.seeding) for one in (model, coarse)]
@@ -156,7 +175,8 @@ def _as_recording(cycle: Cycle) -> geometry.Recording:
     return cycle.measured.with_velocity(
         np.stack([field.numpy() for field in cycle.fields]),
         sigma=np.stack([sigma.numpy() for sigma in cycle.sigmas]),
-        uncovered=np.array(cycle.missing, np.int64), description=f"ensemble of {cycle.count} SPH simulations",
+        uncovered=np.array(cycle.missing, np.int64),
+        description=f"ensemble of {cycle.count} SPH simulations",
     )
 
 
@@ -172,13 +192,20 @@ def _accounts(cycle: Cycle) -> dict[str, Any]:
     kept = cycle.record.summary()
     kept["warnings"] = kept["warnings"] + _noisier(cycle)
     return {
-        "members": cycle.count, "replaced_members": replaced, "events": cycle.events, "shocks": _shocks(cycle),
+        "members": cycle.count,
+        "replaced_members": replaced,
+        "events": cycle.events,
+        "shocks": _shocks(cycle),
         "divergence_not_converged": _divergent(cycle),
         "coasted_frames": sum(1 for event in cycle.events if "coasted" in event),
-        "gain": dict(zip(cycle.options.increments, weights, strict=True)), "spread_factor": cycle.spread.factor,
-        "observation_error_scale": cycle.scale.factor.tolist(), "kernel": [one.kernel for one in cycle.sources],
-        "estimated": learned, "filter": kept, "options": repr(cycle.options),
-    }  # fmt: skip
+        "gain": dict(zip(cycle.options.increments, weights, strict=True)),
+        "spread_factor": cycle.spread.factor,
+        "observation_error_scale": cycle.scale.factor.tolist(),
+        "kernel": [one.kernel for one in cycle.sources],
+        "estimated": learned,
+        "filter": kept,
+        "options": repr(cycle.options),
+    }
 
 
 def _divergent(cycle: Cycle) -> int:
@@ -187,8 +214,10 @@ def _divergent(cycle: Cycle) -> int:
     if left:
         warnings.warn(
             f"removing the divergence did not converge in {len(left)} analyses (of the divergence up to "
-            f"{max(left):.2g} is left); 1 means that the field was left alone", RuntimeWarning, stacklevel=4,
-        )  # fmt: skip
+            f"{max(left):.2g} is left); 1 means that the field was left alone",
+            RuntimeWarning,
+            stacklevel=4,
+        )
     return len(left)
 
 

@@ -57,8 +57,15 @@ class GridForecast:
     """
 
     def __init__(
-        self, model: Simulator, grid: geometry.Grid, velocity: Tensor, mask: Tensor, time: float,
-        transfer: Transfer, *, seed: int = 0,
+        self,
+        model: Simulator,
+        grid: geometry.Grid,
+        velocity: Tensor,
+        mask: Tensor,
+        time: float,
+        transfer: Transfer,
+        *,
+        seed: int = 0,
     ) -> None:
         batched = velocity if velocity.ndim == grid.dimension + 2 else velocity[None]
         self.grid, self.transfer, self.start_time = grid, transfer, time
@@ -128,8 +135,15 @@ class _Sums:
 
 
 def skill(
-    recording: geometry.Recording, model: Simulator, leads: Sequence[float], *, every: int = 1,
-    transfer: Transfer | None = None, save: bool = False, progress: bool = False, seed: int = 0,
+    recording: geometry.Recording,
+    model: Simulator,
+    leads: Sequence[float],
+    *,
+    every: int = 1,
+    transfer: Transfer | None = None,
+    save: bool = False,
+    progress: bool = False,
+    seed: int = 0,
 ) -> ForecastSkill:
     """Forecast from every ``every``-th frame and compare with the frames ``leads`` (s) later.
 
@@ -147,8 +161,9 @@ def skill(
     totals: dict[str, float] = {}
     bar = tqdm(sorted(targets), desc="forecast", unit="start", disable=None if progress else True)
     for start in bar:
-        _from_one_start(recording, model, start, targets[start], transfer, seed, sums, kept if save else None,
-                        seconds, totals)
+        _from_one_start(
+            recording, model, start, targets[start], transfer, seed, sums, kept if save else None, seconds, totals
+        )
     rows = [{"lead": lead, "starts": sums[lead].starts, "nrmse": sums[lead].nrmse()} for lead in leads]
     saved = {lead: _as_recording(recording, frames, lead) for lead, frames in kept.items() if frames}
     config = {"spacing": model.scene.spacing, "scheme": repr(model.scheme), "transfer": repr(transfer)}
@@ -170,8 +185,15 @@ def _targets(recording: geometry.Recording, leads: Sequence[float], every: int) 
 
 
 def _from_one_start(
-    recording: geometry.Recording, model: Simulator, start: int, frames: dict[float, int], transfer: Transfer,
-    seed: int, sums: dict[float, _Sums], kept: dict[float, list] | None, seconds: dict[str, float],
+    recording: geometry.Recording,
+    model: Simulator,
+    start: int,
+    frames: dict[float, int],
+    transfer: Transfer,
+    seed: int,
+    sums: dict[float, _Sums],
+    kept: dict[float, list] | None,
+    seconds: dict[str, float],
     totals: dict[str, float],
 ) -> None:
     began = clock.perf_counter()
@@ -180,8 +202,13 @@ def _from_one_start(
     known = torch.from_numpy(mask[start] & np.isfinite(velocity[start]).all(0))
     model.domain.prepare_until(float(recording.time[start]), float(recording.time[max(frames.values())]))
     going = GridForecast(
-        model, recording.grid, torch.from_numpy(initial), known.to(model.device), float(recording.time[start]),
-        transfer, seed=seed,
+        model,
+        recording.grid,
+        torch.from_numpy(initial),
+        known.to(model.device),
+        float(recording.time[start]),
+        transfer,
+        seed=seed,
     )
     seconds["setup"] += clock.perf_counter() - began
     for lead, frame in sorted(frames.items()):
@@ -200,6 +227,7 @@ def _from_one_start(
 def _as_recording(recording: geometry.Recording, frames: list, lead: float) -> geometry.Recording:
     chosen = recording.select(np.array([frame for frame, _, _ in frames]))
     return chosen.with_velocity(
-        np.stack([one for _, one, _ in frames]), uncovered=np.array([n for _, _, n in frames], np.int64),
+        np.stack([one for _, one, _ in frames]),
+        uncovered=np.array([n for _, _, n in frames], np.int64),
         description=f"forecast {1e3 * lead:g} ms ahead",
     )

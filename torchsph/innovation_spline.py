@@ -66,7 +66,10 @@ class InnovationSpline:
             points, samples, confidence = zip(*each, strict=True)
             anew = (frame - 1) % self.choose_every == 0
             fitted = self.splines.fit_increments(
-                frame, torch.cat(points), torch.cat(samples, 1), torch.cat(confidence),
+                frame,
+                torch.cat(points),
+                torch.cat(samples, 1),
+                torch.cat(confidence),
                 choice=None if anew else self.choice,
             )
             self.choice = choice = fitted[0].choice

@@ -59,8 +59,13 @@ class Stepper:
     """Steps particles with one scheme; holds no state but the neighbour list and the coefficients in use."""
 
     def __init__(
-        self, scheme: WeaklyCompressible, coefficients: Coefficients, search: PairSearch, dimension: int,
-        *, buffered: bool = True,
+        self,
+        scheme: WeaklyCompressible,
+        coefficients: Coefficients,
+        search: PairSearch,
+        dimension: int,
+        *,
+        buffered: bool = True,
     ) -> None:
         """``buffered``: whether there can be particles of reservoirs, which are not the stepper's to move."""
         self.scheme, self.pair_search, self.dimension, self._buffered = scheme, search, dimension, buffered
@@ -79,13 +84,17 @@ class Stepper:
         if laminar is not None:
             laminar = laminar / softened_share(self.support.kernel, self.dimension)
         self.momentum_terms = MomentumTerms(
-            pressure=scheme.pressure, artificial=coefficients.artificial, laminar=laminar,
+            pressure=scheme.pressure,
+            artificial=coefficients.artificial,
+            laminar=laminar,
             tensile=scheme.tensile,
         )
         self._corrected = coefficients.diffusion is not None and scheme.diffusion_form == "corrected"
         self._rate_terms = RateTerms(
-            continuity=scheme.continuity, diffusion=coefficients.diffusion is not None and not self._corrected,
-            concentration=coefficients.shifting is not None, xsph=moves and not self._centroid,
+            continuity=scheme.continuity,
+            diffusion=coefficients.diffusion is not None and not self._corrected,
+            concentration=coefficients.shifting is not None,
+            xsph=moves and not self._centroid,
         )
 
     def step(
@@ -135,8 +144,13 @@ class Stepper:
             drift = drift + share[:, None] * self._xsph(seen, rates.xsph)
         if crowding is not None:
             drift = drift + shifting_displacement(
-                particles, crowding, step, self.coefficients.smoothing_length, self.coefficients.shifting,
-                self.scheme.shifting_speed == "largest", self.scheme.shifting_surface,
+                particles,
+                crowding,
+                step,
+                self.coefficients.smoothing_length,
+                self.coefficients.shifting,
+                self.scheme.shifting_speed == "largest",
+                self.scheme.shifting_surface,
             )
         return self._of_fluid(particles, drift)
 
@@ -228,9 +242,7 @@ class Stepper:
     def _pressureless(particles: Particles) -> Any:
         return particles.state(particles.deviation)
 
-    def _complete(
-        self, particles: Particles, rates: Rates, wall: WallSample | None
-    ) -> tuple[Tensor, Tensor | None]:
+    def _complete(self, particles: Particles, rates: Rates, wall: WallSample | None) -> tuple[Tensor, Tensor | None]:
         """Velocity divergence and crowding gradient, complete at walls."""
         divergence = rates.divergence
         if self.scheme.continuity == "mass":
@@ -290,8 +302,13 @@ class Stepper:
         body = around.body_force(particles)
         if wall is not None and wall.share is not None:
             acceleration = complete_forces(
-                acceleration, particles.velocity, wall, member=particles.member, form=self.scheme.pressure,
-                viscosity=self.coefficients.viscosity if self.scheme.wall.no_slip else None, pressure=pressure,
+                acceleration,
+                particles.velocity,
+                wall,
+                member=particles.member,
+                form=self.scheme.pressure,
+                viscosity=self.coefficients.viscosity if self.scheme.wall.no_slip else None,
+                pressure=pressure,
                 deviation=particles.deviation,
             )
         elif wall is not None and isinstance(self.scheme.wall, PotentialWall):

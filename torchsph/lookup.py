@@ -29,7 +29,13 @@ class LookUp:
     """
 
     def __init__(
-        self, grid: Grid, early: Tensor, late: Tensor, unit: float, plain: float | None = None, *,
+        self,
+        grid: Grid,
+        early: Tensor,
+        late: Tensor,
+        unit: float,
+        plain: float | None = None,
+        *,
         directed: bool = False,
     ) -> None:
         self.channels, self.steady, self._directed = early.shape[0], early is late, directed
@@ -61,14 +67,27 @@ class LookUp:
         points, fraction = points.contiguous(), fraction.to(points.dtype).contiguous()
         out = points.new_empty((points.shape[0], self.channels))
         triple, dimension = ctypes.c_double * 3, points.shape[1]
-        self._function(ctypes.byref(LookUpArguments(
-            dimension=dimension, threads=torch.get_num_threads(), channels=self.channels, count=points.shape[0],
-            fractions=fraction.numel(), early=self._rows[0].data_ptr(),
-            late=None if self.steady else self._rows[1].data_ptr(),
-            plain=None if self._plain is None else self._plain.data_ptr(), points=points.data_ptr(),
-            fraction=fraction.data_ptr(), origin=triple(*self._origin), step=triple(*self._step),
-            counts=(ctypes.c_int64 * 3)(*self._counts), unit=self._directed, out=out.data_ptr(),
-        )))
+        self._function(
+            ctypes.byref(
+                LookUpArguments(
+                    dimension=dimension,
+                    threads=torch.get_num_threads(),
+                    channels=self.channels,
+                    count=points.shape[0],
+                    fractions=fraction.numel(),
+                    early=self._rows[0].data_ptr(),
+                    late=None if self.steady else self._rows[1].data_ptr(),
+                    plain=None if self._plain is None else self._plain.data_ptr(),
+                    points=points.data_ptr(),
+                    fraction=fraction.data_ptr(),
+                    origin=triple(*self._origin),
+                    step=triple(*self._step),
+                    counts=(ctypes.c_int64 * 3)(*self._counts),
+                    unit=self._directed,
+                    out=out.data_ptr(),
+                )
+            )
+        )
         return out
 
     def _by_torch(self, points: Tensor, fraction: Tensor) -> Tensor:

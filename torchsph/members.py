@@ -83,7 +83,13 @@ class Forecaster:
     """
 
     def __init__(
-        self, model: Simulator, coarse: Simulator, grid: geometry.Grid, transfer: Transfer, *, batch: int = 8,
+        self,
+        model: Simulator,
+        coarse: Simulator,
+        grid: geometry.Grid,
+        transfer: Transfer,
+        *,
+        batch: int = 8,
         seed: int = 0,
     ) -> None:
         if batch < 1:
@@ -121,7 +127,12 @@ class Forecaster:
         return Forecasts(states, covered, failed, lost, steps, shock)
 
     def _members(
-        self, ensemble: Ensemble, mine: slice, start: float, mask: Tensor, times: Sequence[float],
+        self,
+        ensemble: Ensemble,
+        mine: slice,
+        start: float,
+        mask: Tensor,
+        times: Sequence[float],
         masks: Sequence[Tensor],
     ) -> tuple[Tensor, int]:
         """(times, k, D, *shape) of this process's members, NaN where one failed; and the steps taken."""
@@ -148,8 +159,14 @@ class Forecaster:
         return torch.where(failed[0], torch.nan, found[:, 0]), covered[0], float(shock[0]), steps
 
     def _run(
-        self, model: Simulator, states: Tensor, parameters: Mapping[str, Tensor], start: float, mask: Tensor,
-        times: Sequence[float], masks: Sequence[Tensor],
+        self,
+        model: Simulator,
+        states: Tensor,
+        parameters: Mapping[str, Tensor],
+        start: float,
+        mask: Tensor,
+        times: Sequence[float],
+        masks: Sequence[Tensor],
     ) -> tuple[Tensor, Tensor, Tensor, Tensor, int]:
         """Grids (times, k, D, *shape), covered (k, *shape), failed (k,), shocks (k,) and the steps taken."""
         going = GridForecast(

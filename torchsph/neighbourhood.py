@@ -103,7 +103,12 @@ class Neighbourhood:
         return (divergence - self.wall_jump() if moves else divergence), crowding
 
     def push(
-        self, source: Tensor, start: Tensor | None, surface: Tensor | None, tolerance: float, iterations: int,
+        self,
+        source: Tensor,
+        start: Tensor | None,
+        surface: Tensor | None,
+        tolerance: float,
+        iterations: int,
         held: Tensor | None = None,
     ) -> tuple[Tensor, PoissonSolution]:
         """Solve -laplacian(u) = ``source`` (N,); minus the gradient of u (N, D), 0 in reservoirs, and the solution.
@@ -124,8 +129,17 @@ class Neighbourhood:
         def solved(group: Tensor, groups: int) -> PoissonSolution:
             pinned = torch.zeros(groups, dtype=torch.int64, device=group.device).index_add(0, group, bound.long())
             return backend.poisson(
-                self.pairs, state, self.support, source, start, free=fluid & ~bound, active=coupled,
-                singular=pinned == 0, tolerance=tolerance, iterations=iterations, group=group,
+                self.pairs,
+                state,
+                self.support,
+                source,
+                start,
+                free=fluid & ~bound,
+                active=coupled,
+                singular=pinned == 0,
+                tolerance=tolerance,
+                iterations=iterations,
+                group=group,
             )
 
         found = solved(p.member, p.members)
@@ -165,9 +179,11 @@ class Neighbourhood:
         nothing = torch.zeros_like(found.residual)
         largest = of_members(apart.mismatch.abs(), "amax", nothing)
         return PoissonSolution(
-            apart.values, of_members(apart.iterations, "amax", found.iterations),
+            apart.values,
+            of_members(apart.iterations, "amax", found.iterations),
             of_members(apart.residual, "amax", nothing),
-            of_members(apart.converged.long(), "amin", torch.ones_like(found.iterations)) > 0, largest,
+            of_members(apart.converged.long(), "amin", torch.ones_like(found.iterations)) > 0,
+            largest,
         )
 
     def _without_thrust(self, push: Tensor) -> Tensor:

@@ -80,12 +80,20 @@ class Source:
         missing = ~torch.isfinite(value).all(0)
         silent = torch.where(missing, int(Reason.MISSING), torch.where(weight > 0, 0, int(Reason.NO_WEIGHT)))
         observations = Observations(
-            torch.nan_to_num(value).flatten(), torch.where(silent == 0, variance, torch.inf).flatten(),
-            position=self.nodes[node], redundancy=float(self.error.redundancy[frame]),
+            torch.nan_to_num(value).flatten(),
+            torch.where(silent == 0, variance, torch.inf).flatten(),
+            position=self.nodes[node],
+            redundancy=float(self.error.redundancy[frame]),
             reason=silent.to(torch.uint8).repeat(len(value)),
         )
-        return Seen(frame, node, self.nodes[node], observations, None if beam is None else beam.T,
-                    self._confidence(frame, node, silent == 0))
+        return Seen(
+            frame,
+            node,
+            self.nodes[node],
+            observations,
+            None if beam is None else beam.T,
+            self._confidence(frame, node, silent == 0),
+        )
 
     def _confidence(self, frame: int, node: Tensor, used: Tensor) -> Tensor:
         """(q,) inverse deviations relative to the best, without what outliers lose: a spline judges those itself."""

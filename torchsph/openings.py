@@ -19,14 +19,23 @@ class Frame:
     """An opening in internal units on the device."""
 
     def __init__(
-        self, plane: OrificePlane, velocity: np.ndarray, length: float, dtype: torch.dtype, device: str,
+        self,
+        plane: OrificePlane,
+        velocity: np.ndarray,
+        length: float,
+        dtype: torch.dtype,
+        device: str,
     ) -> None:
         def tensor(value: np.ndarray) -> Tensor:
             return torch.as_tensor(np.ascontiguousarray(value), dtype=dtype, device=device)
 
         plane = OrificePlane(
-            plane.centroid / length, plane.normal, plane.area / length ** len(plane.basis), plane.basis,
-            plane.rim / length, plane.edges,
+            plane.centroid / length,
+            plane.normal,
+            plane.area / length ** len(plane.basis),
+            plane.basis,
+            plane.rim / length,
+            plane.edges,
         )
         self.centre, self.normal, self.basis = tensor(plane.centroid), tensor(plane.normal), tensor(plane.basis)
         self.area = float(plane.area)

@@ -51,7 +51,8 @@ class Parameters:
         others = ("xsph", "viscosity", "valve_strength")
         given = {f.name: getattr(scheme, f.name) for f in fields(cls) if f.name not in others}
         return cls(
-            **given, xsph=None if scheme.xsph is None else scheme.xsph.epsilon,
+            **given,
+            xsph=None if scheme.xsph is None else scheme.xsph.epsilon,
             viscosity=fluid.viscosity if scheme.laminar_viscosity else None,
         )
 
@@ -111,9 +112,16 @@ class Coefficients:
         sound = None if p.sound_speed is None else p.sound_speed / units.speed
         artificial = _acting(p.artificial_viscosity)
         return cls(
-            sound_speed=sound, gamma=p.gamma, smoothing_length=p.smoothing_ratio, courant=p.courant,
-            background=_acting(p.background_pressure), artificial=None if artificial is None else artificial * sound,
-            diffusion=p.density_diffusion, shifting=p.shifting, bulk_damping=p.bulk_damping, xsph=p.xsph,
+            sound_speed=sound,
+            gamma=p.gamma,
+            smoothing_length=p.smoothing_ratio,
+            courant=p.courant,
+            background=_acting(p.background_pressure),
+            artificial=None if artificial is None else artificial * sound,
+            diffusion=p.density_diffusion,
+            shifting=p.shifting,
+            bulk_damping=p.bulk_damping,
+            xsph=p.xsph,
             viscosity=viscosity,
         )
 

@@ -29,7 +29,11 @@ class FilteredRun:
 
 
 def filter_sph(
-    measured: geometry.Recording, model: Simulator, *, error: ObservationError | None = None, seed: int = 0,
+    measured: geometry.Recording,
+    model: Simulator,
+    *,
+    error: ObservationError | None = None,
+    seed: int = 0,
     progress: bool = False,
 ) -> FilteredRun:
     """Run one simulator through a recording and impose each frame on the running particles (thesis 3.1.6).
@@ -60,7 +64,8 @@ def filter_sph(
         fields.append(found.value[0].cpu().numpy())
         missing.append(int((mask & ~found.covered[0]).sum()))
     recording = measured.with_velocity(
-        np.stack(fields), uncovered=np.array(missing, np.int64),
+        np.stack(fields),
+        uncovered=np.array(missing, np.int64),
         description="one SPH simulation with every frame imposed on its particles",
     )
     return FilteredRun(recording, run.record.summary())
@@ -83,4 +88,3 @@ def _update(
     device, dtype = run.particles.position.device, run.particles.position.dtype
     fields = torch.from_numpy(np.concatenate([observed, gain[None]])).to(device, dtype)
     run.pull(measured.grid, fields[:-1], fields[-1], torch.from_numpy(weight).to(device, dtype))
-

@@ -14,7 +14,11 @@ _WALL_LAYER = 1.5
 
 
 def flow_perturbations(
-    count: int, mask: np.ndarray, spacing: tuple[float, ...], amplitude: float, length: float,
+    count: int,
+    mask: np.ndarray,
+    spacing: tuple[float, ...],
+    amplitude: float,
+    length: float,
     generator: torch.Generator,
 ) -> Tensor:
     """``count`` fields (count, D, *shape) of mean zero with RMS ``amplitude`` (m/s per component) over the mask.

@@ -57,10 +57,20 @@ def make_smoother(preset: str) -> regularize.Smoother:
 
 
 def run_methods(
-    measured: geometry.Recording, methods: Sequence[str], *, preset: str = "default", spacing: float | None = None,
-    members: int | None = None, also: Sequence[geometry.Recording] = (), truth: geometry.Recording | None = None,
-    lag: int | None = None, checkpoints: str | Path | None = None, resume: bool = False, seed: int = 0,
-    device: str = "cpu", progress: bool = False,
+    measured: geometry.Recording,
+    methods: Sequence[str],
+    *,
+    preset: str = "default",
+    spacing: float | None = None,
+    members: int | None = None,
+    also: Sequence[geometry.Recording] = (),
+    truth: geometry.Recording | None = None,
+    lag: int | None = None,
+    checkpoints: str | Path | None = None,
+    resume: bool = False,
+    seed: int = 0,
+    device: str = "cpu",
+    progress: bool = False,
 ) -> dict[str, MethodResult]:
     """Run methods by name on one measurement, in the order of ``METHODS``.
 
@@ -100,10 +110,19 @@ def run_methods(
         results["sph"] = timer.result(run.recording, run.info)
     if "ensemble" in methods:
         many = assimilate(
-            measured, make_model(measured, preset=preset, spacing=CONTROL_SHARE * spacing, device=device),
-            coarse=model, members=DEFAULT_MEMBERS if members is None else members, options=EnsembleOptions(lag=lag),
-            also=also, splines=splines, smoothed=smoothed, truth=truth, checkpoints=checkpoints, resume=resume,
-            seed=seed, progress=progress,
+            measured,
+            make_model(measured, preset=preset, spacing=CONTROL_SHARE * spacing, device=device),
+            coarse=model,
+            members=DEFAULT_MEMBERS if members is None else members,
+            options=EnsembleOptions(lag=lag),
+            also=also,
+            splines=splines,
+            smoothed=smoothed,
+            truth=truth,
+            checkpoints=checkpoints,
+            resume=resume,
+            seed=seed,
+            progress=progress,
         )
         results["ensemble"] = timer.result(many.recording, many.info)
     free = from_last(results.get("free"))
@@ -124,8 +143,16 @@ class _Timer:
 
 
 def forecast_skill(
-    recording: geometry.Recording, leads: Sequence[float], *, every: int = 1, preset: str = "default",
-    spacing: float | None = None, device: str = "cpu", save: bool = False, progress: bool = False, seed: int = 0,
+    recording: geometry.Recording,
+    leads: Sequence[float],
+    *,
+    every: int = 1,
+    preset: str = "default",
+    spacing: float | None = None,
+    device: str = "cpu",
+    save: bool = False,
+    progress: bool = False,
+    seed: int = 0,
 ) -> ForecastSkill:
     """Skill of the simulator on a recording; see ``forecast.skill``. ``spacing`` (m) defaults to the grid's."""
     began = clock.perf_counter()

@@ -214,7 +214,13 @@ class Population:
     def _sums(self, particles: Particles, fields: Tensor, place: Tensor, member: Tensor) -> Moments:
         """Moments, weighted by mass, of ``fields`` (N, C) of particles at places (n, D) of members (n,)."""
         return self._backend.interpolate(
-            particles.position, particles.member, fields, self._support, place, member, period=self.domain.period,
+            particles.position,
+            particles.member,
+            fields,
+            self._support,
+            place,
+            member,
+            period=self.domain.period,
             weight=particles.mass,
         )
 
@@ -224,9 +230,7 @@ class Population:
         more = [value for value in (particles.pressure, particles.confidence) if value is not None]
         return torch.stack([particles.mass, particles.deviation, *particles.velocity.unbind(1), *more], 1)
 
-    def _taken(
-        self, particles: Particles, row: Tensor, place: Tensor, member: Tensor, around: Moments
-    ) -> Particles:
+    def _taken(self, particles: Particles, row: Tensor, place: Tensor, member: Tensor, around: Moments) -> Particles:
         """Particles with new ones at ``place``, which those in ``row`` pay for in mass and momentum."""
         dimension, total = particles.dimension, around.value
         mean = around.field / total[:, None]
@@ -253,7 +257,13 @@ class Population:
         rest = iter(value[:, 2 + dimension :].unbind(1))
         return paid.joined(
             Particles(
-                place, velocity, value[:, 1], mass, member, torch.full_like(member, FLUID), particles.members,
+                place,
+                velocity,
+                value[:, 1],
+                mass,
+                member,
+                torch.full_like(member, FLUID),
+                particles.members,
                 pressure=None if particles.pressure is None else next(rest),
                 confidence=None if particles.confidence is None else next(rest).clamp_min(0.0),
             )
@@ -262,6 +272,11 @@ class Population:
     def _received(self, particles: Particles, row: Tensor, place: Tensor, member: Tensor, values: Tensor) -> Tensor:
         """Sum over new places of W times ``values`` (n, C), at the particles in ``row``: (len(row), C)."""
         return self._backend.interpolate(
-            place, member, values, self._support, particles.position[row], particles.member[row],
+            place,
+            member,
+            values,
+            self._support,
+            particles.position[row],
+            particles.member[row],
             period=self.domain.period,
         ).field

@@ -97,7 +97,13 @@ class PressureValves:
         def read(values: Tensor, old: Tensor, depth: Tensor) -> Tensor:
             place = mine.position - (height + depth)[:, None] * frame.normal
             found = fetch_at(
-                self._backend, place, mine.member, near.position, near.member, values[:, None], _RADIUS,
+                self._backend,
+                place,
+                mine.member,
+                near.position,
+                near.member,
+                values[:, None],
+                _RADIUS,
                 period=self.domain.period,
             )
             return torch.where(found.covered, found.value[:, 0], old)

@@ -177,8 +177,13 @@ class ProjectionStepper:
 
     def _shifted(self, particles: Particles, crowding: Tensor, step: Tensor) -> Tensor:
         shift = shifting_displacement(
-            particles, crowding, step, self.coefficients.smoothing_length, self.coefficients.shifting,
-            self.scheme.shifting_speed == "largest", self.scheme.shifting_surface,
+            particles,
+            crowding,
+            step,
+            self.coefficients.smoothing_length,
+            self.coefficients.shifting,
+            self.scheme.shifting_speed == "largest",
+            self.scheme.shifting_surface,
         )
         return torch.where(particles.fluid[:, None], shift, torch.zeros_like(shift))
 

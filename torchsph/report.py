@@ -117,9 +117,15 @@ def _draw_cut(axis: matplotlib.axes.Axes, picture: slices.Cut, top: float, arrow
     thin = (slice(step // 2, None, step),) * 2
     s, t = np.meshgrid(mm * picture.across, mm * picture.along)
     axis.quiver(
-        s[thin], t[thin], picture.velocity[0][thin], picture.velocity[1][thin],
-        color="white", angles="xy", scale=8 * top, width=0.006,
-    )  # fmt: skip
+        s[thin],
+        t[thin],
+        picture.velocity[0][thin],
+        picture.velocity[1][thin],
+        color="white",
+        angles="xy",
+        scale=8 * top,
+        width=0.006,
+    )
     axis.add_collection(LineCollection(mm * picture.outline, colors="0.2", linewidths=1.0))
     axis.set_aspect("equal")
     axis.tick_params(labelsize=7)
@@ -143,20 +149,31 @@ def _draw_curves(
         start, end = max(1e3 * opening, time[0]), min(1e3 * closing, time[-1])
         if end > start:
             axis.axvspan(start, end, color=("tab:blue", "tab:red")[shade % 2], alpha=0.07, lw=0)
-            axis.text(0.5 * (start + end), 0.97, f"orifice {int(region)} open", ha="center", va="top",
-                      transform=axis.get_xaxis_transform(), fontsize=8, color="0.4")  # fmt: skip
+            axis.text(
+                0.5 * (start + end),
+                0.97,
+                f"orifice {int(region)} open",
+                ha="center",
+                va="top",
+                transform=axis.get_xaxis_transform(),
+                fontsize=8,
+                color="0.4",
+            )
     axis.set(xlabel="time, ms", ylabel=label, ylim=(0, None))
     axis.grid(alpha=0.3)
     axis.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
 
 
-def _draw_table(
-    axis: matplotlib.axes.Axes, scores: Mapping[str, Scores], seconds: Mapping[str, float]
-) -> None:
+def _draw_table(axis: matplotlib.axes.Axes, scores: Mapping[str, Scores], seconds: Mapping[str, float]) -> None:
     heading, *rows = scores_table(scores, seconds)
     axis.axis("off")
-    table = axis.table([row[1:] for row in rows], rowLabels=[row[0] for row in rows], colLabels=heading[1:],
-                       loc="center", cellLoc="right")  # fmt: skip
+    table = axis.table(
+        [row[1:] for row in rows],
+        rowLabels=[row[0] for row in rows],
+        colLabels=heading[1:],
+        loc="center",
+        cellLoc="right",
+    )
     table.auto_set_font_size(False)
     table.set_fontsize(8)
     table.scale(1, 1.3)

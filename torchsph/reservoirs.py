@@ -151,7 +151,10 @@ class Reservoirs:
                 self._frames.clear()
             opening = self.openings[number]
             self._frames[label] = Frame(
-                opening.at(time), opening.velocity(time) / self.units.speed, self.units.length, self.domain.dtype,
+                opening.at(time),
+                opening.velocity(time) / self.units.speed,
+                self.units.length,
+                self.domain.dtype,
                 self.domain.device,
             )
         return self._frames[label]
@@ -211,9 +214,11 @@ class Reservoirs:
         # a lattice does not tile an opening: its particles share the channel's volume
         mass = place.new_full((members.numel(),), frame.area * self.far / max(count, 1))
         new = Particles(
-            position=place.repeat(copies, 1), velocity=place.new_zeros((count * copies, place.shape[1])),
+            position=place.repeat(copies, 1),
+            velocity=place.new_zeros((count * copies, place.shape[1])),
             deviation=self._mouth_mean(particles, frame, particles.deviation)[members].repeat_interleave(count),
-            mass=mass.repeat_interleave(count), member=members.repeat_interleave(count),
+            mass=mass.repeat_interleave(count),
+            member=members.repeat_interleave(count),
             kind=kind.repeat(copies),
             members=particles.members,
         )

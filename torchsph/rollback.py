@@ -13,8 +13,17 @@ from .schemes import Rollback
 
 # accounts of what happened to the fluid: what happens in a stretch that is taken back has not happened
 _TAKEN_BACK = (
-    "inserted", "removed", "crossed_wall", "inflow", "outflow", "energy_in", "energy_out", "wall_work", "source_work",
-    "merged", "reseeded",
+    "inserted",
+    "removed",
+    "crossed_wall",
+    "inflow",
+    "outflow",
+    "energy_in",
+    "energy_out",
+    "wall_work",
+    "source_work",
+    "merged",
+    "reseeded",
 )
 
 

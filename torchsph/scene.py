@@ -170,7 +170,7 @@ class Scene:
         intervals = recording.valve_intervals_or_derived()
         regions: dict[int, list[tuple[float, float]]] = {}
         span = (float(recording.time[0]), max(float(recording.time[-1]), float(recording.time[0]) + recording.period))
-        for region, opening, closing in ([] if intervals is None else intervals):
+        for region, opening, closing in [] if intervals is None else intervals:
             rows = regions.setdefault(int(region), [])
             if recording.period:  # what was open at the first or last frame was so at the ends of what is known
                 opening = float(opening) if math.isfinite(opening) else span[0]

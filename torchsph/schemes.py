@@ -246,8 +246,11 @@ class WeaklyCompressible:
             if value is not None and not value >= 0:
                 raise ValueError(f"WeaklyCompressible.{name} must not be negative, got {value}")
         for name, known in (
-            ("continuity", CONTINUITY_FORMS), ("pressure", PRESSURE_FORMS), ("order", ORDERS),
-            ("shifting_speed", ("local", "largest")), ("diffusion_form", ("plain", "corrected")),
+            ("continuity", CONTINUITY_FORMS),
+            ("pressure", PRESSURE_FORMS),
+            ("order", ORDERS),
+            ("shifting_speed", ("local", "largest")),
+            ("diffusion_form", ("plain", "corrected")),
             ("density_filter", ("shepard", "mls")),
         ):
             if getattr(self, name) not in known:

@@ -204,9 +204,7 @@ def _boltzmann(
     return torch.cat(chosen) if chosen else corner[:0]
 
 
-def _quiet(
-    simulator: Simulator, seeding: Seeding, lower: Tensor, upper: Tensor, generator: torch.Generator
-) -> Tensor:
+def _quiet(simulator: Simulator, seeding: Seeding, lower: Tensor, upper: Tensor, generator: torch.Generator) -> Tensor:
     """A lattice inside the walls, relaxed by shifting down the crowding gradient (Colagrossi et al. 2012)."""
     # centred: rows at uneven distances from opposite walls are a density gradient that no wall model can undo
     size = torch.ceil(upper - lower - 1e-3)

@@ -162,7 +162,11 @@ class Simulation:
                 checkpoints.keep(self.particles, self._acceleration, done)
             self._ramp(done)
             step = self._control.step(
-                self.particles, self._acceleration, self._stepper.coefficients, left, longest,
+                self.particles,
+                self._acceleration,
+                self._stepper.coefficients,
+                left,
+                longest,
                 None if checkpoints is None else checkpoints.factor,
             )
             hopeless = (left > 0) & (step * _MOST_STEPS < left)
@@ -377,8 +381,15 @@ class Simulation:
         points = points.to(p.position.dtype).repeat(self.members, 1)
         owner = torch.arange(self.members, device=p.member.device).repeat_interleave(len(node))
         found = fetch_at(
-            self._backend, points, owner, p.position, p.member, p.velocity * self.units.speed, FETCH_RADIUS,
-            period=self.domain.period, weight=p.confidence,
+            self._backend,
+            points,
+            owner,
+            p.position,
+            p.member,
+            p.velocity * self.units.speed,
+            FETCH_RADIUS,
+            period=self.domain.period,
+            weight=p.confidence,
         )
         dimension = grid.dimension
         value = p.velocity.new_zeros((self.members, dimension, grid.size))

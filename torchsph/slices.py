@@ -46,14 +46,10 @@ def valve_plane(recording: geometry.Recording) -> Plane:
         origin, across, along = _long_axis_plane(recording, points)
     s, t = (points - origin) @ across, (points - origin) @ along
     margin = 0.02 * max(np.ptp(s), np.ptp(t))
-    return Plane(
-        origin, across, along, (s.min() - margin, s.max() + margin, t.min() - margin, t.max() + margin)
-    )
+    return Plane(origin, across, along, (s.min() - margin, s.max() + margin, t.min() - margin, t.max() + margin))
 
 
-def _long_axis_plane(
-    recording: geometry.Recording, points: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _long_axis_plane(recording: geometry.Recording, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     surface = recording.wall.at(0)
     labels = np.unique(surface.region[surface.region > 0])[:2]
     centres = [surface.centroids[surface.part(label)].mean(0) for label in labels]

@@ -79,7 +79,13 @@ class FrameSmoother:
         return self._fit(frame, uncertainty=uncertainty, choice=self.choice(frame))
 
     def fit_increments(
-        self, frame: int, points: Tensor, samples: Tensor, weight: Tensor, *, choice: regularize.Choice | None = None,
+        self,
+        frame: int,
+        points: Tensor,
+        samples: Tensor,
+        weight: Tensor,
+        *,
+        choice: regularize.Choice | None = None,
     ) -> list[regularize.SplineField]:
         """Splines of increments (k, n, D) sampled at points (n, D) with confidences (n,); walls are at rest.
 
@@ -87,12 +93,22 @@ class FrameSmoother:
         others. ``choice``: noise and smoothness of an earlier increment; None chooses them as well.
         """
         return self._of_increments.fit_many(
-            points.double(), samples.double(), weight.double(), self._resting(frame),
-            divergence_points=self._inside(frame), choice=choice, judged=0,
+            points.double(),
+            samples.double(),
+            weight.double(),
+            self._resting(frame),
+            divergence_points=self._inside(frame),
+            choice=choice,
+            judged=0,
         )
 
     def fit_along(
-        self, frame: int, points: Tensor, samples: Tensor, weight: Tensor, beam: Tensor,
+        self,
+        frame: int,
+        points: Tensor,
+        samples: Tensor,
+        weight: Tensor,
+        beam: Tensor,
         choice: regularize.Choice | None = None,
     ) -> regularize.SplineField:
         """The spline of one increment that is known along unit vectors ``beam`` (n, D) alone.
@@ -101,8 +117,12 @@ class FrameSmoother:
         """
         known = {} if choice is None else {"curvature": choice.curvature, "no_slip": choice.no_slip}
         return self._of_increments.fixed(**known).fit(
-            points.double(), samples.double(), weight.double(), self._resting(frame),
-            divergence_points=self._inside(frame), beam=beam,
+            points.double(),
+            samples.double(),
+            weight.double(),
+            self._resting(frame),
+            divergence_points=self._inside(frame),
+            beam=beam,
         )
 
     @property
@@ -130,8 +150,14 @@ class FrameSmoother:
         field = recording.velocity[frame].reshape(dimension, -1)
         samples = torch.from_numpy(np.nan_to_num(field, copy=True)).double().T
         return self.smoother.fit(
-            self.nodes[used], samples[used], weight[used], wall_rows(recording, self.motion, frame),
-            divergence_points=self.nodes[mask], beam=self._beam(frame, used), uncertainty=uncertainty, choice=choice,
+            self.nodes[used],
+            samples[used],
+            weight[used],
+            wall_rows(recording, self.motion, frame),
+            divergence_points=self.nodes[mask],
+            beam=self._beam(frame, used),
+            uncertainty=uncertainty,
+            choice=choice,
         )
 
     @property
@@ -159,9 +185,7 @@ class FrameSmoother:
         """Whether a frame has anything to fit."""
         return bool((node_weights(self.recording, frame) > 0).any())
 
-    def draws(
-        self, fitted: regularize.SplineField, frame: int, count: int, generator: torch.Generator
-    ) -> Tensor:
+    def draws(self, fitted: regularize.SplineField, frame: int, count: int, generator: torch.Generator) -> Tensor:
         """(count, D, *shape) deviations from a fit of ``uncertainty=True``, drawn from its posterior; 0 outside.
 
         Their RMS over the mask is that of the stated deviation, component by component.
@@ -220,8 +244,9 @@ def smooth_frames(frames: FrameSmoother, progress: bool = False) -> geometry.Rec
     """
     recording = frames.recording
     fields = np.zeros(recording.velocity.shape, np.float32)
-    missing = np.array([0 if frames.measures(f) else np.count_nonzero(recording.mask[f])
-                        for f in range(recording.frames)], np.int64)  # fmt: skip
+    missing = np.array(
+        [0 if frames.measures(f) else np.count_nonzero(recording.mask[f]) for f in range(recording.frames)], np.int64
+    )
     with tqdm(total=recording.frames, desc="spline", disable=None if progress else True, unit="frame") as bar:
         groups = [partial(frames.fitted, group, bar.update) for group in range(frames.groups)]
         for group, (choice, fitted) in enumerate(shared(groups)):

@@ -68,8 +68,12 @@ def truncated_gaussian(truncation: float = 3.0) -> SmoothingKernel:
     kept = {2: 1.0 - tail, 3: math.erf(t / math.sqrt(2.0)) - math.sqrt(2.0 / math.pi) * t * tail}
     sigma = {d: (2.0 * math.pi) ** (-0.5 * d) / kept[d] for d in (2, 3)}
     return SmoothingKernel(
-        f"gaussian-{truncation:g}", t, lambda q: torch.exp(-0.5 * q * q), lambda q: -torch.exp(-0.5 * q * q),
-        sigma, "Gronli 2017 eq. 2.10-2.11",
+        f"gaussian-{truncation:g}",
+        t,
+        lambda q: torch.exp(-0.5 * q * q),
+        lambda q: -torch.exp(-0.5 * q * q),
+        sigma,
+        "Gronli 2017 eq. 2.10-2.11",
     )
 
 
@@ -116,24 +120,43 @@ KERNELS: dict[str, SmoothingKernel] = {
         "cubic", 2.0, _cubic_shape, _cubic_slope, {2: 10 / (7 * _PI), 3: 1 / _PI}, "Monaghan 1992 (M4 spline)"
     ),
     "quintic": SmoothingKernel(
-        "quintic", 3.0, _quintic_shape, _quintic_slope, {2: 7 / (478 * _PI), 3: 1 / (120 * _PI)},
+        "quintic",
+        3.0,
+        _quintic_shape,
+        _quintic_slope,
+        {2: 7 / (478 * _PI), 3: 1 / (120 * _PI)},
         "Morris, Fox & Zhu 1997 eq. 3 (M6 spline)",
     ),
     "wendland_c2": SmoothingKernel(
-        "wendland_c2", 2.0, lambda q: _wendland_t(q) ** 4 * (1 + 2 * q), lambda q: -5 * _wendland_t(q) ** 3,
-        {2: 7 / (4 * _PI), 3: 21 / (16 * _PI)}, _WENDLAND,
+        "wendland_c2",
+        2.0,
+        lambda q: _wendland_t(q) ** 4 * (1 + 2 * q),
+        lambda q: -5 * _wendland_t(q) ** 3,
+        {2: 7 / (4 * _PI), 3: 21 / (16 * _PI)},
+        _WENDLAND,
     ),
     "wendland_c4": SmoothingKernel(
-        "wendland_c4", 2.0, lambda q: _wendland_t(q) ** 6 * (1 + 3 * q + 35 / 12 * q**2),
-        lambda q: -_wendland_t(q) ** 5 * (14 / 3 + 35 / 3 * q), {2: 9 / (4 * _PI), 3: 495 / (256 * _PI)}, _WENDLAND,
+        "wendland_c4",
+        2.0,
+        lambda q: _wendland_t(q) ** 6 * (1 + 3 * q + 35 / 12 * q**2),
+        lambda q: -(_wendland_t(q) ** 5) * (14 / 3 + 35 / 3 * q),
+        {2: 9 / (4 * _PI), 3: 495 / (256 * _PI)},
+        _WENDLAND,
     ),
     "wendland_c6": SmoothingKernel(
-        "wendland_c6", 2.0, lambda q: _wendland_t(q) ** 8 * (1 + 4 * q + 6.25 * q**2 + 4 * q**3),
-        lambda q: -_wendland_t(q) ** 7 * (5.5 + 19.25 * q + 22 * q**2),
-        {2: 78 / (28 * _PI), 3: 1365 / (512 * _PI)}, _WENDLAND,
+        "wendland_c6",
+        2.0,
+        lambda q: _wendland_t(q) ** 8 * (1 + 4 * q + 6.25 * q**2 + 4 * q**3),
+        lambda q: -(_wendland_t(q) ** 7) * (5.5 + 19.25 * q + 22 * q**2),
+        {2: 78 / (28 * _PI), 3: 1365 / (512 * _PI)},
+        _WENDLAND,
     ),
     "spiky": SmoothingKernel(
-        "spiky", 1.0, lambda q: (1 - q).clamp_min(0.0) ** 3, _spiky_slope, {2: 10 / _PI, 3: 15 / _PI},
+        "spiky",
+        1.0,
+        lambda q: (1 - q).clamp_min(0.0) ** 3,
+        _spiky_slope,
+        {2: 10 / _PI, 3: 15 / _PI},
         "Desbrun & Gascuel 1996; Gronli 2017 eq. 2.13-2.14",
     ),
 }

@@ -27,7 +27,11 @@ class Cleaned:
 
 
 def without_divergence(
-    velocity: np.ndarray, mask: np.ndarray, spacing: tuple[float, ...], *, reduction: float = 0.1,
+    velocity: np.ndarray,
+    mask: np.ndarray,
+    spacing: tuple[float, ...],
+    *,
+    reduction: float = 0.1,
     iterations: int = 2000,
 ) -> Cleaned:
     """The field (D, *shape) nearest to ``velocity`` whose central differences have next to no divergence.

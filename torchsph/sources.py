@@ -31,9 +31,7 @@ class Sources:
         push: (N, D), the last acceleration, internal, for the account of the work; None while all valves are shut.
     """
 
-    def __init__(
-        self, scene: Scene, model: PressureSource, units: Units, device: str, dtype: torch.dtype
-    ) -> None:
+    def __init__(self, scene: Scene, model: PressureSource, units: Units, device: str, dtype: torch.dtype) -> None:
         self.motion, self.units, self.dtype, self.device = scene.walls, units, dtype, device
         self.valves = scene.valves
         self._core: dict[int, float] = {}
@@ -87,7 +85,11 @@ class Sources:
         return total
 
     def without_gone(
-        self, particles: Particles, open_regions: tuple[int, ...], time: float, record: Record,
+        self,
+        particles: Particles,
+        open_regions: tuple[int, ...],
+        time: float,
+        record: Record,
         pressure: Callable[[Particles], Tensor],
     ) -> Particles:
         """Take out the particles that are more than a spacing beyond an open orifice, and count them."""
@@ -106,9 +108,7 @@ class Sources:
         """(n,) bool: points (n, D) less than half a spacing before the plane of an orifice, or behind it."""
         return ((position - self._at(region, time, 0)) * self._at(region, time, 1)).sum(1) > -0.5
 
-    def _account(
-        self, gone: Particles, valve: int, record: Record, pressure: Callable[[Particles], Tensor]
-    ) -> None:
+    def _account(self, gone: Particles, valve: int, record: Record, pressure: Callable[[Particles], Tensor]) -> None:
         """Note the particles that have left through a valve."""
         energy = energy_unit(self.units, self._density, self.dimension)
         record.removed[:, valve] += gone.per_member(torch.ones_like(gone.member), "sum")

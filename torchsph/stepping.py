@@ -20,7 +20,12 @@ class StepControl:
         self._last_limit = torch.zeros(record.members, dtype=torch.float64, device=record.failed.device)
 
     def step(
-        self, particles: Particles, acceleration: Tensor, coefficients: Coefficients, left: Tensor, longest: float,
+        self,
+        particles: Particles,
+        acceleration: Tensor,
+        coefficients: Coefficients,
+        left: Tensor,
+        longest: float,
         factor: Tensor | None = None,
     ) -> Tensor:
         """Each member's step (members,) float64: the smallest limit, evened out over what is left of the interval.

@@ -33,8 +33,12 @@ def tait_deviation(pressure: Tensor, sound_speed: float | Tensor, gamma: float |
 
 
 def step_limits(
-    speed: Tensor, acceleration: Tensor, smoothing_length: float | Tensor, sound_speed: float | Tensor,
-    viscosity: float | Tensor, courant: float | Tensor,
+    speed: Tensor,
+    acceleration: Tensor,
+    smoothing_length: float | Tensor,
+    sound_speed: float | Tensor,
+    viscosity: float | Tensor,
+    courant: float | Tensor,
 ) -> Tensor:
     """Acoustic, viscous and force limits (Morris et al. 1997 eqs. 30-32) of each member: (3, members), internal time.
 
@@ -76,8 +80,13 @@ def softened_share(kernel: SmoothingKernel, dimension: int) -> float:
 
 
 def shifting_displacement(
-    particles: Particles, concentration: Tensor, step: Tensor, smoothing_length: float | Tensor,
-    strength: float | Tensor, largest: bool = False, surface: float | None = None,
+    particles: Particles,
+    concentration: Tensor,
+    step: Tensor,
+    smoothing_length: float | Tensor,
+    strength: float | Tensor,
+    largest: bool = False,
+    surface: float | None = None,
 ) -> Tensor:
     """Displacement -A h |v| dt grad C that evens out the particles (Lind et al. 2012, speed-limited form), (N, D).
 

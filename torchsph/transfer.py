@@ -39,9 +39,7 @@ def wendland_weight(ratio: Tensor) -> Tensor:
     return gap**4 * (1.0 + 4.0 * ratio)
 
 
-def first_order_value(
-    moment0: Tensor, moment1: Tensor, moment2: Tensor, value0: Tensor, value1: Tensor
-) -> Tensor:
+def first_order_value(moment0: Tensor, moment1: Tensor, moment2: Tensor, value0: Tensor, value1: Tensor) -> Tensor:
     """MLS value at the origin from moments of a weight w over offsets s and values A.
 
     Args: sums of w (M,), w s (M, D), w s (x) s (M, D, D), w A (M, C), w s (x) A (M, D, C).
@@ -78,8 +76,17 @@ def solve_small(matrix: Tensor, right: Tensor) -> Tensor:
 
 
 def fetch_at(
-    backend: Backend, points: Tensor, point_member: Tensor, position: Tensor, member: Tensor, value: Tensor,
-    radius: float, *, period: Tensor | None = None, widen: int = 2, weight: Tensor | None = None,
+    backend: Backend,
+    points: Tensor,
+    point_member: Tensor,
+    position: Tensor,
+    member: Tensor,
+    value: Tensor,
+    radius: float,
+    *,
+    period: Tensor | None = None,
+    widen: int = 2,
+    weight: Tensor | None = None,
 ) -> Fetched:
     """Particle values at points by first-order MLS.
 
@@ -102,7 +109,13 @@ def fetch_at(
             break
         support = Support(kernel("wendland_c2"), 0.5 * radius, dimension)
         m = backend.interpolate(
-            position, member, value, support, points[open_points], point_member[open_points], period=period,
+            position,
+            member,
+            value,
+            support,
+            points[open_points],
+            point_member[open_points],
+            period=period,
             weight=weight,
         )
         some = first_order_value(m.value, m.first, m.second, m.field, m.field_first)
@@ -136,9 +149,7 @@ def impose_at(
     return torch.cat(values), torch.cat(shares)
 
 
-def _impose_chunk(
-    points: Tensor, grid: Grid, field: Tensor, weight: Tensor, reach: float
-) -> tuple[Tensor, Tensor]:
+def _impose_chunk(points: Tensor, grid: Grid, field: Tensor, weight: Tensor, reach: float) -> tuple[Tensor, Tensor]:
     dimension, channels = points.shape[1], field.shape[0]
     located = grid.locate(points)
     index, offset = _block(located, grid, reach)
@@ -151,7 +162,10 @@ def _impose_chunk(
     first = w[:, :, None] * offset
     moment0 = w.sum(1)
     value = first_order_value(
-        moment0, first.sum(1), first.transpose(1, 2) @ offset, (w[:, :, None] * carried).sum(1),
+        moment0,
+        first.sum(1),
+        first.transpose(1, 2) @ offset,
+        (w[:, :, None] * carried).sum(1),
         first.transpose(1, 2) @ carried,
     )
     full = _full_weight(dimension, reach)
@@ -178,9 +192,7 @@ def _full_weight(dimension: int, reach: float) -> float:
     return {2: 3.141592653589793 / 7.0, 3: 2.0 * 3.141592653589793 / 21.0}[dimension] * reach**dimension
 
 
-def pulled(
-    points: Tensor, velocity: Tensor, grid: Grid, target: Tensor, gain: Tensor, weight: Tensor
-) -> Tensor:
+def pulled(points: Tensor, velocity: Tensor, grid: Grid, target: Tensor, gain: Tensor, weight: Tensor) -> Tensor:
     """Velocity (N, D) pulled towards a grid field where it is known; see ``particle_filter``."""
     value, share = impose_at(points, grid, torch.cat([target, gain[None]]), weight)
     # at the very end of a node's reach the weights underflow, and their fit is no number

@@ -12,9 +12,7 @@ from .schemes import CompleteKernelWall
 _SERIES_TERMS = 200
 
 
-def taylor_green_2d(
-    points: Tensor, time: float, viscosity: float, speed: float = 1.0, length: float = 1.0
-) -> Tensor:
+def taylor_green_2d(points: Tensor, time: float, viscosity: float, speed: float = 1.0, length: float = 1.0) -> Tensor:
     """Velocity (n, 2), m/s, of the decaying vortex array (Taylor & Green 1937) at points (n, 2), m.
 
     u = -U exp(-8 pi^2 nu t / L^2) cos(2 pi x / L) sin(2 pi y / L), v its mirror image.
@@ -91,9 +89,14 @@ def observed_order(spacings: list[float], errors: list[float]) -> float:
 # particles has lost 34 % of its kinetic energy at t = 5, with strength 8 10 %, with strength 16 and h = 1.8 0.4 %. At a
 # tenth of the speed of sound, strength 16 is a shift of h^2 / 2 grad C per step, Lind et al.'s limit of stability.
 PERIODIC_OPTIONS = {
-    "smoothing_ratio": 2.0, "sound_speed": 10.0, "pressure": "sum", "artificial_viscosity": None,
-    "shifting": 16.0, "shifting_speed": "largest", "order": "verlet",
-}  # fmt: skip
+    "smoothing_ratio": 2.0,
+    "sound_speed": 10.0,
+    "pressure": "sum",
+    "artificial_viscosity": None,
+    "shifting": 16.0,
+    "shifting_speed": "largest",
+    "order": "verlet",
+}
 # in space h = 2 costs a third more and its kernel smooths the viscous forces by 2 % at Re 50 on 24^3
 PERIODIC_OPTIONS_3D = PERIODIC_OPTIONS | {"smoothing_ratio": 1.8}
 # Incompressible steps: a shorter relaxation stirs the fluid (3 % instead of .5 % at 60^2), weaker shifting leaves
@@ -106,15 +109,23 @@ CHANNEL_OPTIONS = {"smoothing_ratio": 2.0, "sound_speed": 10.0, "artificial_visc
 # Closed boxes that are stirred: pressures of both signs last there, and only the difference form is exact for either;
 # it needs more diffusion of the density (delta-SPH's 0.1 leaves noise in the corners).
 CAVITY_OPTIONS = {
-    "smoothing_ratio": 2.0, "sound_speed": 10.0, "pressure": "difference", "artificial_viscosity": None,
-    "density_diffusion": 0.3, "shifting": 16.0, "shifting_speed": "largest", "constant_volume": True,
+    "smoothing_ratio": 2.0,
+    "sound_speed": 10.0,
+    "pressure": "difference",
+    "artificial_viscosity": None,
+    "density_diffusion": 0.3,
+    "shifting": 16.0,
+    "shifting_speed": "largest",
+    "constant_volume": True,
     "wall": CompleteKernelWall(sliding=True),
-}  # fmt: skip
+}
 # Free surfaces: the switched pressure form is not conservative and feeds energy into a surface under tension (Sun et
 # al. 2017 keep the sum there), and shifting pushes particles out of it.
 FREE_SURFACE_OPTIONS = {"pressure": "sum", "shifting": None, "sound_speed": 10.0}
 # A stretched fluid (a rotating patch) tears from tensile instability by omega t = 1 unless it is evened out below its
 # surface; where a vacuum shall open, this shifting would fill it.
 STRETCHED_SURFACE_OPTIONS = FREE_SURFACE_OPTIONS | {
-    "shifting": 4.0, "shifting_speed": "largest", "shifting_surface": 0.15,
-}  # fmt: skip
+    "shifting": 4.0,
+    "shifting_speed": "largest",
+    "shifting_surface": 0.15,
+}

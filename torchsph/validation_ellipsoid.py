@@ -166,9 +166,11 @@ class PotentialFlow:
         speed = (wall * self.strain[[0, 2]] * normal).sum(1)
         area = [weight * stretch * wall[:, 0] * (np.pi - first) / 2, weight * wide * self.radius * np.sin(first) / 2]
         return (
-            np.concatenate([wall, disc]), np.concatenate([normal, up]),
-            np.concatenate([speed, np.full(count, self.plug)]), np.concatenate(area),
-        )  # fmt: skip
+            np.concatenate([wall, disc]),
+            np.concatenate([normal, up]),
+            np.concatenate([speed, np.full(count, self.plug)]),
+            np.concatenate(area),
+        )
 
     @cached_property
     def _fit(self) -> tuple[np.ndarray, float]:
@@ -194,8 +196,9 @@ class PotentialFlow:
         # grad (rho^n P_n) has the z component n rho^(n-1) P_(n-1); the radial one follows from Euler's relation
         power = number * rho[:, None] ** (number - 1)
         along = power * before
-        across = np.where(r[:, None] > 1e-9, (power * rho[:, None] * value - z[:, None] * along) / np.maximum(
-            r, 1e-9)[:, None], 0.0)
+        across = np.where(
+            r[:, None] > 1e-9, (power * rho[:, None] * value - z[:, None] * along) / np.maximum(r, 1e-9)[:, None], 0.0
+        )
         return np.stack([across, along], 1) / self._scale
 
     def velocity(self, points: np.ndarray) -> np.ndarray:

@@ -27,8 +27,13 @@ _FETCH_RADIUS = 2.0
 
 
 def taylor_green(
-    resolution: int, reynolds: float = 100.0, *, dimension: int = 2, scheme: Scheme | None = None,
-    backend: str = "auto", seeding: Seeding = _LATTICE,
+    resolution: int,
+    reynolds: float = 100.0,
+    *,
+    dimension: int = 2,
+    scheme: Scheme | None = None,
+    backend: str = "auto",
+    seeding: Seeding = _LATTICE,
 ) -> Simulation:
     """A Taylor-Green vortex on resolution^dimension particles at its start: velocity and pressure as they should be.
 
@@ -68,9 +73,7 @@ def kinetic_energy(run: Simulation) -> float:
     return float(run.particles.velocity.double().square().sum(1).mean()) / 2
 
 
-def channel(
-    flow: str, across: int, *, scheme: WeaklyCompressible | None = None, backend: str = "auto"
-) -> Simulation:
+def channel(flow: str, across: int, *, scheme: WeaklyCompressible | None = None, backend: str = "auto") -> Simulation:
     """A channel of width 1 m at rest that starts to flow: "poiseuille" (driven by a force) or "couette" (by a wall).
 
     The largest speed of the steady flow is 1 m/s and nu = 0.1 m^2/s. Raises ValueError on an unknown flow.
@@ -82,9 +85,13 @@ def channel(
     surface = geometry.polygon(np.array([[-over, 0], [length + over, 0], [length + over, 1], [-over, 1]]), spacing)
     drive = np.where(np.isclose(surface.vertices[:, 1], 1.0), 1.0 if flow == "couette" else 0.0, 0.0)
     scene = Scene(
-        spacing=spacing, fluid=Fluid(1.0, _CHANNEL_VISCOSITY), walls=_driven(surface, drive), period=(length, None),
-        gravity=(8 * _CHANNEL_VISCOSITY if flow == "poiseuille" else 0.0, 0.0), dimension=2,
-    )  # fmt: skip
+        spacing=spacing,
+        fluid=Fluid(1.0, _CHANNEL_VISCOSITY),
+        walls=_driven(surface, drive),
+        period=(length, None),
+        gravity=(8 * _CHANNEL_VISCOSITY if flow == "poiseuille" else 0.0, 0.0),
+        dimension=2,
+    )
     scheme = scheme or WeaklyCompressible(**validation.CHANNEL_OPTIONS)
     return Simulator(scene, scheme, backend=backend, seeding=_LATTICE).start(0.0)
 
@@ -115,9 +122,11 @@ def velocity_at(run: Simulation, points: np.ndarray) -> np.ndarray:
     p, backend = run.particles, choose_backend(run.simulator.backend, run.simulator.device)
     at = torch.as_tensor(points / run.simulator.scene.spacing, dtype=p.position.dtype)
     member = torch.zeros(len(at), dtype=torch.int64)
-    return fetch_at(
-        backend, at, member, p.position, p.member, p.velocity, _FETCH_RADIUS, period=run.domain.period
-    ).value.double().numpy()
+    return (
+        fetch_at(backend, at, member, p.position, p.member, p.velocity, _FETCH_RADIUS, period=run.domain.period)
+        .value.double()
+        .numpy()
+    )
 
 
 def _driven(surface: geometry.Surface, speed: np.ndarray) -> geometry.WallMotion:

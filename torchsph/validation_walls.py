@@ -59,5 +59,8 @@ def cylinder_couette(radius: Tensor, inner: tuple[float, float], outer: tuple[fl
 # Shear between curved walls: even particles matter as much as the wall does. With that preset's shifting the Couette
 # flow between cylinders is 2.5 % off at 16 across, with this one 0.2 % (tests/test_validation_cylinders.py).
 CURVED_WALL_OPTIONS = {
-    "sound_speed": 10.0, "artificial_viscosity": None, "shifting": 8.0, "shifting_speed": "largest",
-}  # fmt: skip
+    "sound_speed": 10.0,
+    "artificial_viscosity": None,
+    "shifting": 8.0,
+    "shifting_speed": "largest",
+}

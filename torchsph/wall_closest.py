@@ -14,9 +14,7 @@ from geometry.closest import SurfaceIndex
 from .pairs.native import ClosestArguments, LibraryMissing, library
 
 
-def closest_on_grid(
-    grid: Grid, solid: Surface, values: np.ndarray, limit: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def closest_on_grid(grid: Grid, solid: Surface, values: np.ndarray, limit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Distance (n,), m, of every node to a surface, and ``values`` (nv, D) of its vertices at the closest point (n, D).
 
     Exact (for the faces as they are) where the distance is below ``limit`` (n,), m; farther away the closest point of
@@ -44,17 +42,23 @@ def _compiled(
         "distance": np.empty(grid.size),
         "carried": np.zeros((grid.size, dimension)),
     }
-    handle.sph_grid_closest(ctypes.byref(ClosestArguments(
-        dimension=dimension, threads=torch.get_num_threads(), faces=len(solid.faces), step=grid.spacing[0],
-        origin=(ctypes.c_double * 3)(*grid.origin), counts=(ctypes.c_int64 * 3)(*grid.shape[::-1]),
-        **{name: array.ctypes.data for name, array in arrays.items()},
-    )))
+    handle.sph_grid_closest(
+        ctypes.byref(
+            ClosestArguments(
+                dimension=dimension,
+                threads=torch.get_num_threads(),
+                faces=len(solid.faces),
+                step=grid.spacing[0],
+                origin=(ctypes.c_double * 3)(*grid.origin),
+                counts=(ctypes.c_int64 * 3)(*grid.shape[::-1]),
+                **{name: array.ctypes.data for name, array in arrays.items()},
+            )
+        )
+    )
     return arrays["distance"], arrays["carried"]
 
 
-def closest_by_tree(
-    grid: Grid, solid: Surface, values: np.ndarray, limit: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def closest_by_tree(grid: Grid, solid: Surface, values: np.ndarray, limit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """As ``closest_on_grid``, without compiled code; every node farther away than its limit takes the nearest one."""
     nodes = grid.nodes().numpy()
     index = SurfaceIndex(solid, grid.spacing[0])

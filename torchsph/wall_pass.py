@@ -34,16 +34,30 @@ def complete_rates(
     velocity, divergence = velocity.contiguous(), divergence.contiguous()
     crowding = None if crowding is None else crowding.contiguous()
     whole, even = torch.empty_like(divergence), None if crowding is None else torch.empty_like(crowding)
-    code.sph_wall_rates(_arguments(
-        wall, velocity, velocity=velocity.data_ptr(), divergence=divergence.data_ptr(), crowding=address(crowding),
-        whole_divergence=whole.data_ptr(), whole_crowding=address(even),
-    ))
+    code.sph_wall_rates(
+        _arguments(
+            wall,
+            velocity,
+            velocity=velocity.data_ptr(),
+            divergence=divergence.data_ptr(),
+            crowding=address(crowding),
+            whole_divergence=whole.data_ptr(),
+            whole_crowding=address(even),
+        )
+    )
     return whole, even
 
 
 def complete_forces(
-    acceleration: Tensor, velocity: Tensor, wall: WallSample, *, viscosity: float | Tensor | None, member: Tensor,
-    form: str = "symmetric", pressure: Tensor | None = None, deviation: Tensor | None = None,
+    acceleration: Tensor,
+    velocity: Tensor,
+    wall: WallSample,
+    *,
+    viscosity: float | Tensor | None,
+    member: Tensor,
+    form: str = "symmetric",
+    pressure: Tensor | None = None,
+    deviation: Tensor | None = None,
 ) -> Tensor:
     """Pair accelerations (N, D) with the walls' pressure and friction, over the share of the kernel in the fluid.
 
@@ -58,12 +72,21 @@ def complete_forces(
     given = [None if t is None else t.contiguous() for t in (pressure, deviation)]
     nu = None if viscosity is None else torch.as_tensor(viscosity, dtype=torch.float64).reshape(-1).contiguous()
     out, member = torch.empty_like(acceleration), member.contiguous()
-    code.sph_wall_forces(_arguments(
-        wall, velocity, velocity=velocity.data_ptr(), form=PRESSURE_FORMS.index(form), pressure=address(given[0]),
-        deviation=address(given[1]),
-        viscosity=address(nu), viscosities=0 if nu is None else nu.numel(), member=member.data_ptr(),
-        acceleration=acceleration.data_ptr(), whole_acceleration=out.data_ptr(),
-    ))
+    code.sph_wall_forces(
+        _arguments(
+            wall,
+            velocity,
+            velocity=velocity.data_ptr(),
+            form=PRESSURE_FORMS.index(form),
+            pressure=address(given[0]),
+            deviation=address(given[1]),
+            viscosity=address(nu),
+            viscosities=0 if nu is None else nu.numel(),
+            member=member.data_ptr(),
+            acceleration=acceleration.data_ptr(),
+            whole_acceleration=out.data_ptr(),
+        )
+    )
     return out
 
 
@@ -86,17 +109,34 @@ def near_wall(
     near, distance = torch.empty_like(member), torch.empty_like(wall.distance, memory_format=torch.contiguous_format)
     before, after, member, held = (t.contiguous() for t in (before, after, member, held))
     step = step.double().contiguous()
-    found = code.sph_wall_near(_arguments(
-        wall, after, before=before.data_ptr(), after=after.data_ptr(), distance=wall.distance.data_ptr(),
-        distance_stride=wall.distance.stride(0), step=step.data_ptr(), member=member.data_ptr(),
-        held=held.data_ptr(), gap=gap, near=near.data_ptr(), near_distance=distance.data_ptr(),
-    ))
+    found = code.sph_wall_near(
+        _arguments(
+            wall,
+            after,
+            before=before.data_ptr(),
+            after=after.data_ptr(),
+            distance=wall.distance.data_ptr(),
+            distance_stride=wall.distance.stride(0),
+            step=step.data_ptr(),
+            member=member.data_ptr(),
+            held=held.data_ptr(),
+            gap=gap,
+            near=near.data_ptr(),
+            near_distance=distance.data_ptr(),
+        )
+    )
     return near[:found], distance[:found]
 
 
 def _forces_by_torch(
-    acceleration: Tensor, velocity: Tensor, wall: WallSample, viscosity: float | Tensor | None, member: Tensor,
-    form: str, pressure: Tensor | None, deviation: Tensor | None,
+    acceleration: Tensor,
+    velocity: Tensor,
+    wall: WallSample,
+    viscosity: float | Tensor | None,
+    member: Tensor,
+    form: str,
+    pressure: Tensor | None,
+    deviation: Tensor | None,
 ) -> Tensor:
     if pressure is not None:
         acceleration = acceleration + wall_pressure_force(form, pressure, deviation, wall)
@@ -137,7 +177,15 @@ def _compiled(wall: WallSample | None, *tensors: Tensor | None) -> _Code | None:
 
 def _arguments(wall: WallSample, vectors: Tensor, **arrays: int | float | None) -> ctypes._CArgObject:
     count, channels = wall.rows.shape
-    return ctypes.byref(WallArguments(
-        dimension=vectors.shape[1], threads=torch.get_num_threads(), count=count, channels=channels,
-        rows=wall.rows.data_ptr(), smallest_share=SMALLEST_SHARE, smallest_gap=SMALLEST_FRICTION_DISTANCE, **arrays,
-    ))
+    return ctypes.byref(
+        WallArguments(
+            dimension=vectors.shape[1],
+            threads=torch.get_num_threads(),
+            count=count,
+            channels=channels,
+            rows=wall.rows.data_ptr(),
+            smallest_share=SMALLEST_SHARE,
+            smallest_gap=SMALLEST_FRICTION_DISTANCE,
+            **arrays,
+        )
+    )

@@ -42,8 +42,17 @@ class WallFields:
     """
 
     def __init__(
-        self, motion: WallMotion, spacing: float, speed: float, kernel: SmoothingKernel, smoothing_length: float,
-        complete: bool, device: str | torch.device, dtype: torch.dtype, *, sliding: bool = False,
+        self,
+        motion: WallMotion,
+        spacing: float,
+        speed: float,
+        kernel: SmoothingKernel,
+        smoothing_length: float,
+        complete: bool,
+        device: str | torch.device,
+        dtype: torch.dtype,
+        *,
+        sliding: bool = False,
     ) -> None:
         motion.surface(float(motion.time[0])).check()
         self.motion, self.spacing, self.speed = motion, spacing, speed
@@ -93,9 +102,7 @@ class WallFields:
                 channels.append(self._share.swept(d, (carried * channels[1]).sum(0), channels[1]))
         return by_node(torch.cat(channels).to(self.device))
 
-    def _distance(
-        self, surface: Surface, time: float, open_regions: tuple[int, ...]
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def _distance(self, surface: Surface, time: float, open_regions: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
         """Distance (n,) from the closed part of the wall, positive in blood and open channels; velocity (n, D).
 
         Exact inside as far as kernels see and outside as far as particles may stray; farther away a bound does.

@@ -21,6 +21,7 @@ SMALLEST_FRICTION_DISTANCE = 0.15
 # a particle whose kernel lies almost wholly behind walls would divide by nothing
 SMALLEST_SHARE = 0.1
 
+
 @dataclass(frozen=True)
 class WallSample:
     """The wall as particles see it, internal units.

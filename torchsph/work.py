@@ -59,8 +59,13 @@ class WorkAccount:
         return account if account._moving or account._sources is not None else None
 
     def note(
-        self, before: Particles, stepped: Particles, wall: WallSample | None, step: Tensor,
-        stepper: Stepper | ProjectionStepper, counts: Tensor,
+        self,
+        before: Particles,
+        stepped: Particles,
+        wall: WallSample | None,
+        step: Tensor,
+        stepper: Stepper | ProjectionStepper,
+        counts: Tensor,
     ) -> None:
         """Account for one step.
 
@@ -81,7 +86,11 @@ class WorkAccount:
         getattr(self._record, name).add_(torch.where(counts, work, torch.zeros_like(work)))
 
     def _power_of_walls(
-        self, before: Particles, stepped: Particles, wall: WallSample, step: Tensor,
+        self,
+        before: Particles,
+        stepped: Particles,
+        wall: WallSample,
+        step: Tensor,
         stepper: Stepper | ProjectionStepper,
     ) -> Tensor:
         """Power per mass (N,) of the walls on the particles, internal; few passes, because every step pays for them."""

@@ -38,9 +38,13 @@ def table(measured: geometry.Recording, truth: geometry.Recording, lag: int | No
         rows[f"ensemble, lag {lag}"] = (late, time.perf_counter() - began)
     plain = measured.with_velocity(filled_velocity(measured))
     rows = {
-        "raw": (measured, 0.0), "raw over time": (averaged(plain), 0.0), "free": rows.pop("free"),
-        "spline": rows.pop("spline"), "spline over time": (averaged(found["spline"].recording), 0.0), **rows,
-    }  # fmt: skip
+        "raw": (measured, 0.0),
+        "raw over time": (averaged(plain), 0.0),
+        "free": rows.pop("free"),
+        "spline": rows.pop("spline"),
+        "spline over time": (averaged(found["spline"].recording), 0.0),
+        **rows,
+    }
     return {name: scored(one, truth, measured) | {"seconds": seconds} for name, (one, seconds) in rows.items()}
 
 

@@ -99,17 +99,24 @@ def run(case: Case, truth: geometry.Recording, seed: int) -> dict:
     )
     seconds, worked = time.perf_counter() - began, time.process_time() - worked
     found = {
-        "spline": smoothed, "smoothed": averaged(smoothed), "free": run_freely(measured, coarse, smoothed.velocity[0]),
+        "spline": smoothed,
+        "smoothed": averaged(smoothed),
+        "free": run_freely(measured, coarse, smoothed.velocity[0]),
         "ensemble": ensemble.recording,
-    }  # fmt: skip
+    }
     error = {name: evaluate(one, truth)["nrmse"].value for name, one in found.items()}
     return {
-        "members": case.members, "nrmse": error,
-        "to_spline": error["ensemble"] / error["spline"], "to_smoothed": error["ensemble"] / error["smoothed"],
-        "spread_over_skill": spread_over_skill(ensemble.recording, truth).value, "seconds": seconds,
-        "processor_seconds": worked, "frames": measured.frames,
-        "real_time_factor": seconds / float(np.ptp(measured.time)), "gain": ensemble.info["gain"],
-    }  # fmt: skip
+        "members": case.members,
+        "nrmse": error,
+        "to_spline": error["ensemble"] / error["spline"],
+        "to_smoothed": error["ensemble"] / error["smoothed"],
+        "spread_over_skill": spread_over_skill(ensemble.recording, truth).value,
+        "seconds": seconds,
+        "processor_seconds": worked,
+        "frames": measured.frames,
+        "real_time_factor": seconds / float(np.ptp(measured.time)),
+        "gain": ensemble.info["gain"],
+    }
 
 
 def around_the_fastest(truth: geometry.Recording) -> geometry.Recording:
@@ -127,8 +134,9 @@ def draw(rows: list[dict], path: Path) -> None:
     from matplotlib import pyplot as plt
 
     sweeps = [name for name in dict.fromkeys(row["sweep"] for row in rows) if name != "kind"]
-    figure, axes = plt.subplots(1, max(len(sweeps), 1), figsize=(4 * max(len(sweeps), 1), 3.6), layout="constrained",
-                                sharey=True, squeeze=False)  # fmt: skip
+    figure, axes = plt.subplots(
+        1, max(len(sweeps), 1), figsize=(4 * max(len(sweeps), 1), 3.6), layout="constrained", sharey=True, squeeze=False
+    )
     for axis, sweep in zip(axes[0], sweeps, strict=False):
         some = sorted((row for row in rows if row["sweep"] == sweep), key=lambda row: row["value"])
         for name, style, label in LINES:
@@ -174,8 +182,11 @@ def main() -> None:
         done[key] = done.get(key) or run(case, truth, options.seed)
         rows.append({"sweep": case.sweep, "value": case.value, **done[key]})
         errors = "  ".join(f"{name} {value:.3f}" for name, value in rows[-1]["nrmse"].items())
-        print(f"{case.sweep:15s} {case.value!s:22s} {errors}  ratio {rows[-1]['to_spline']:.3f} "
-              f"spread/skill {rows[-1]['spread_over_skill']:.2f}  {rows[-1]['seconds']:.0f} s", flush=True)  # fmt: skip
+        print(
+            f"{case.sweep:15s} {case.value!s:22s} {errors}  ratio {rows[-1]['to_spline']:.3f} "
+            f"spread/skill {rows[-1]['spread_over_skill']:.2f}  {rows[-1]['seconds']:.0f} s",
+            flush=True,
+        )
         if options.json:  # after each case: a long sweep may be stopped
             about = {"seconds_of_flow": truth.time[[0, -1]].tolist(), "threads": options.threads, "seed": options.seed}
             options.json.write_text(json.dumps(about | {"rows": rows}, indent=1) + "\n")

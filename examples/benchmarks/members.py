@@ -75,9 +75,13 @@ def main() -> None:
     for members, seconds in least.items():
         each = seconds / members
         row = {
-            "members": members, "spacing": args.spacing, "device": args.device,
-            "milliseconds": 1e3 * each / (frames - 1), "over_one": each / least[1], "real_time": seconds / beat,
-        }  # fmt: skip
+            "members": members,
+            "spacing": args.spacing,
+            "device": args.device,
+            "milliseconds": 1e3 * each / (frames - 1),
+            "over_one": each / least[1],
+            "real_time": seconds / beat,
+        }
         rows.append(row)
         print(f"{members:7d} {row['milliseconds']:8.1f} {row['over_one']:10.2f} {row['real_time']:11.2f}")
     if args.json:

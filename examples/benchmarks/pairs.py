@@ -291,8 +291,7 @@ def table(report: dict[str, object]) -> str:
         lines.append(f"multiply-add peak of a core ({report['instruction_set']}): {peak:.0f} Gflop/s")
     before, after = report["load"]
     lines.append(
-        f"load of the machine (1 min): {before[0]:.1f} before, {after[0]:.1f} after; "
-        f"{os.cpu_count()} processors"
+        f"load of the machine (1 min): {before[0]:.1f} before, {after[0]:.1f} after; {os.cpu_count()} processors"
     )
     return "\n".join(lines)
 
@@ -300,9 +299,7 @@ def table(report: dict[str, object]) -> str:
 def main() -> int:
     """Measure, print, and write the JSON file where one is asked for."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument(
-        "--quick", action="store_true", help="under a minute; no case above 200,000 particles"
-    )
+    parser.add_argument("--quick", action="store_true", help="under a minute; no case above 200,000 particles")
     parser.add_argument("--json", metavar="FILE", help="write the rows there")
     options = parser.parse_args()
     if "OMP_WAIT_POLICY" not in os.environ:  # OpenMP reads it when torch is loaded: start again with it

@@ -65,9 +65,13 @@ def ours(spacing: float, mach: float) -> dict:
     cpu, wall = time.process_time() - cpu, time.perf_counter() - wall
     path = list(zip((times / math.sqrt(2 * GRAVITY)).tolist(), front, strict=True))
     return {
-        "wall_s": wall, "cpu_s": cpu, "steps": int(run.record.steps), "particles": run.particles.count, "boundary": 0,
+        "wall_s": wall,
+        "cpu_s": cpu,
+        "steps": int(run.record.steps),
+        "particles": run.particles.count,
+        "boundary": 0,
         "front": path,
-    }  # fmt: skip
+    }
 
 
 def pysph(python: str, spacing: float, threads: int) -> dict:
@@ -75,8 +79,14 @@ def pysph(python: str, spacing: float, threads: int) -> dict:
     with tempfile.TemporaryDirectory() as folder:
         result = Path(folder) / "result.json"
         command = [
-            python, str(DRIVER), str(result), str(spacing), str(LAST / math.sqrt(2 * GRAVITY)), "wcsph", str(threads),
-        ]  # fmt: skip
+            python,
+            str(DRIVER),
+            str(result),
+            str(spacing),
+            str(LAST / math.sqrt(2 * GRAVITY)),
+            "wcsph",
+            str(threads),
+        ]
         done = subprocess.run(
             command, capture_output=True, text=True, cwd=folder, env=os.environ | {"OMP_NUM_THREADS": str(threads)}
         )
@@ -104,11 +114,13 @@ def scored(name: str, runs: list[dict]) -> dict:
     time, front = np.array(runs[0]["front"]).T
     time = time * math.sqrt(2 * GRAVITY)
     return {
-        "name": name, **{k: runs[0][k] for k in ("particles", "boundary", "steps")},
-        **{k: min(run[k] for run in runs) for k in ("wall_s", "cpu_s")}, "walls_s": [run["wall_s"] for run in runs],
+        "name": name,
+        **{k: runs[0][k] for k in ("particles", "boundary", "steps")},
+        **{k: min(run[k] for run in runs) for k in ("wall_s", "cpu_s")},
+        "walls_s": [run["wall_s"] for run in runs],
         "error_martin_moyce": front_error(time, front, MARTIN_MOYCE_1952),
         "error_koshizuka_oka": front_error(time, front, KOSHIZUKA_OKA_1996),
-    }  # fmt: skip
+    }
 
 
 def main() -> None:

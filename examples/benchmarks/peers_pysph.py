@@ -47,17 +47,33 @@ def main(result: str, spacing: str, duration: str, scheme: str, threads: str) ->
         # the number of threads comes from OMP_NUM_THREADS, which OpenMP read before this line
         parallel = "--openmp" if int(threads) > 1 else "--no-openmp"
         app = DamBreak(fname="dam_break")
-        app.setup([
-            "--dx", spacing, "--tf", duration, "--scheme", scheme, parallel, "--pfreq", "1000000000", "-d", folder,
-        ])  # fmt: skip
+        app.setup(
+            [
+                "--dx",
+                spacing,
+                "--tf",
+                duration,
+                "--scheme",
+                scheme,
+                parallel,
+                "--pfreq",
+                "1000000000",
+                "-d",
+                folder,
+            ]
+        )
         cpu, wall = time.process_time(), time.perf_counter()
         app.solver.solve(show_progress=False)
         cpu, wall = time.process_time() - cpu, time.perf_counter() - wall
     fluid, boundary = app.particles
     row = {
-        "wall_s": wall, "cpu_s": cpu, "steps": app.solver.count, "particles": fluid.get_number_of_particles(),
-        "boundary": boundary.get_number_of_particles(), "front": app.front,
-    }  # fmt: skip
+        "wall_s": wall,
+        "cpu_s": cpu,
+        "steps": app.solver.count,
+        "particles": fluid.get_number_of_particles(),
+        "boundary": boundary.get_number_of_particles(),
+        "front": app.front,
+    }
     with open(result, "w") as out:
         json.dump(row, out)
 

@@ -62,9 +62,23 @@ def theirs(python: str, scheme: str, resolution: int, uneven: bool) -> dict:
     """One run of PySPH's example; seconds from its first step on, without set-up and compilation."""
     with tempfile.TemporaryDirectory() as folder:
         command = [
-            python, "-c", DRIVER, "--nx", str(resolution), "--re", "100", "--tf", str(DECAY_TIME), "--no-openmp",
-            "--disable-output", "-d", folder, "--perturb", "0.2" if uneven else "0", *SCHEMES[scheme],
-        ]  # fmt: skip
+            python,
+            "-c",
+            DRIVER,
+            "--nx",
+            str(resolution),
+            "--re",
+            "100",
+            "--tf",
+            str(DECAY_TIME),
+            "--no-openmp",
+            "--disable-output",
+            "-d",
+            folder,
+            "--perturb",
+            "0.2" if uneven else "0",
+            *SCHEMES[scheme],
+        ]
         environment = os.environ | {"OMP_NUM_THREADS": "1"}
         text = subprocess.run(command, env=environment, stdout=subprocess.PIPE, text=True, check=True).stdout
     (wall, cpu), (end, *columns) = (json.loads(line) for line in text.splitlines()[-2:])

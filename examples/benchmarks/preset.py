@@ -98,22 +98,27 @@ NO_SLIP_OFF = CompleteKernelWall(no_slip=False)
 RIVALS: dict[str, dict[str, dict[str, object]]] = {
     "preset": {"as it is": {}, "projection instead": {"preset": "projection"}},
     "kernel": {
-        "cubic": {"kernel": "cubic"}, "quintic, h = 1": {"kernel": "quintic", "smoothing_ratio": 1.0},
+        "cubic": {"kernel": "cubic"},
+        "quintic, h = 1": {"kernel": "quintic", "smoothing_ratio": 1.0},
         "Wendland C4, h = 1.6": {"kernel": "wendland_c4", "smoothing_ratio": 1.6},
     },
     "smoothing ratio": {"1.1": {"smoothing_ratio": 1.1}, "1.6": {"smoothing_ratio": 1.6}},
     "sound speed": {"3.5 m/s": {"sound_speed": 3.5}, "10 m/s": {"sound_speed": 10.0}},
     "pressure": {form: {"pressure": form} for form in ("sum", "symmetric", "difference")},
     "density diffusion": {
-        "none": {"density_diffusion": None}, "0.1": {"density_diffusion": 0.1}, "0.4": {"density_diffusion": 0.4},
+        "none": {"density_diffusion": None},
+        "0.1": {"density_diffusion": 0.1},
+        "0.4": {"density_diffusion": 0.4},
         "corrected": {"diffusion_form": "corrected"},
     },
     "bulk damping": {"none": {"bulk_damping": None}, "1.0": {"bulk_damping": 1.0}},
     "artificial viscosity": {"0.02": {"artificial_viscosity": 0.02}, "0.1": {"artificial_viscosity": 0.1}},
     "laminar viscosity": {"none": {"laminar_viscosity": False}},
     "shifting": {
-        "none": {"shifting": None}, "0.5, local speed": {"shifting": 0.5, "shifting_speed": "local"},
-        "1": {"shifting": 1.0}, "8": {"shifting": 8.0},
+        "none": {"shifting": None},
+        "0.5, local speed": {"shifting": 0.5, "shifting_speed": "local"},
+        "1": {"shifting": 1.0},
+        "8": {"shifting": 8.0},
     },
     "courant": {"0.35": {"courant": 0.35}, "0.7": {"courant": 0.7}},
     "transfer": {
@@ -125,12 +130,14 @@ RIVALS: dict[str, dict[str, dict[str, object]]] = {
     "order": {name: {"order": name} for name in ("thesis", "verlet", "predictor_corrector")},
     "wall": {"potential": {"wall": PotentialWall()}, "complete, free slip": {"wall": NO_SLIP_OFF}},
     "valve": {
-        "flat reservoir": {"valve": Reservoir("flat")}, "volume not held": {"valve": Reservoir(relaxation=None)},
-        "run-out of 3": {"valve": Reservoir(run_out=3.0)}, "pressure source": {"valve": PressureSource()},
+        "flat reservoir": {"valve": Reservoir("flat")},
+        "volume not held": {"valve": Reservoir(relaxation=None)},
+        "run-out of 3": {"valve": Reservoir(run_out=3.0)},
+        "pressure source": {"valve": PressureSource()},
         "shut": {"valve": None},
     },
     "population": {"controlled": {"population": PopulationControl()}},
-}  # fmt: skip
+}
 # what a flow without walls does not have
 WALLS_ONLY = ("wall", "valve", "transfer", "seeding")
 # shown by --quick
@@ -155,8 +162,9 @@ def ventricle(recording: geometry.Recording, spacing: float, every: int, changes
     return {
         "nrmse": {f"{1e3 * row['lead']:g} ms": row["nrmse"]["model"] for row in result.leads},
         "persistence": {f"{1e3 * row['lead']:g} ms": row["nrmse"]["persistence"] for row in result.leads},
-        "starts": result.leads[0]["starts"], "cpu_s": time.process_time() - began,
-    }  # fmt: skip
+        "starts": result.leads[0]["starts"],
+        "cpu_s": time.process_time() - began,
+    }
 
 
 def vortex(resolution: int, changes: dict[str, object]) -> dict:
@@ -199,17 +207,23 @@ def main() -> None:
     print(f"{'component: rival':<42} {'NRMSE':<16} {'CPU s':>6} {'vortex':>8}   {file.name}")
     for component, rivals in RIVALS.items():
         for rival, changes in rivals.items() if not options.quick or component in QUICK else ():
-            row = {"component": component, "rival": rival,
-                   "ventricle": ventricle(recording, options.spacing, options.every, changes)}
+            row = {
+                "component": component,
+                "rival": rival,
+                "ventricle": ventricle(recording, options.spacing, options.every, changes),
+            }
             if component not in WALLS_ONLY:
                 row["vortex"] = vortex(20 if options.quick else 40, changes)
             rows.append(row)
             print(line(row), flush=True)
     if options.json:
         report = {
-            "rows": rows, "recording": file.name, "spacing": options.spacing, "every": options.every,
+            "rows": rows,
+            "recording": file.name,
+            "spacing": options.spacing,
+            "every": options.every,
             "load": os.getloadavg()[0],
-        }  # fmt: skip
+        }
         options.json.write_text(json.dumps(report, indent=1) + "\n")
 
 

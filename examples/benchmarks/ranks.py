@@ -106,10 +106,18 @@ def compared(members: int, frames: int, repeats: int) -> dict:
     spent = min(sum(run["cpu"]) for run in runs[2])
     same = len({run["digest"] for found in runs.values() for run in found}) == 1
     return {
-        "members": members, "frames": frames, "wall": [one["wall"], two["wall"]], "ratio": one["wall"] / two["wall"],
-        "cpu": alone, "cpu_of_two": two["cpu"], "critical": critical, "bound": alone / critical,
-        "repeated": spent / alone - 1.0, "launch": [one["launch"], two["launch"]], "same_bits": same,
-    }  # fmt: skip
+        "members": members,
+        "frames": frames,
+        "wall": [one["wall"], two["wall"]],
+        "ratio": one["wall"] / two["wall"],
+        "cpu": alone,
+        "cpu_of_two": two["cpu"],
+        "critical": critical,
+        "bound": alone / critical,
+        "repeated": spent / alone - 1.0,
+        "launch": [one["launch"], two["launch"]],
+        "same_bits": same,
+    }
 
 
 def main() -> None:
@@ -134,8 +142,11 @@ def main() -> None:
         one, two = row["wall"]
         each = " + ".join(f"{seconds:.1f}" for seconds in row["cpu_of_two"])
         same = "yes" if row["same_bits"] else "NO"
-        print(f"{members:7d} {one:8.1f} {two:8.1f} {row['ratio']:8.2f} {row['cpu']:12.1f}   {each:15s} "
-              f"{row['bound']:7.2f} {100 * row['repeated']:7.0f} %  {same}", flush=True)
+        print(
+            f"{members:7d} {one:8.1f} {two:8.1f} {row['ratio']:8.2f} {row['cpu']:12.1f}   {each:15s} "
+            f"{row['bound']:7.2f} {100 * row['repeated']:7.0f} %  {same}",
+            flush=True,
+        )
     if args.json:
         args.json.write_text(json.dumps(rows, indent=1))
 

@@ -192,43 +192,92 @@ def ventricle(
 PRESET_CURVES = {
     "weakly compressible preset": preset("weakly_compressible"),
     "projection": preset("projection", max_step=None, courant=0.27),
-}  # fmt: skip
+}
 REFERENCE = {"reference backend": {"backend": "reference"}}
 FLOWS = {
-    "plane": Flow(plane, WeaklyCompressible(**validation.PERIODIC_OPTIONS), (20, 40, 60), (16, 24), {
-        "options for periodic flows": {}, "sound speed 20": {"sound_speed": 20.0},
-        "sound speed 7": {"sound_speed": 7.0},
-        "quintic, h = 1.5": FINER, "Wendland C4, h = 2.4": SMOOTHER, "h = 1.6": {"smoothing_ratio": 1.6},
-        "predictor-corrector": {"order": "predictor_corrector"}, "symplectic Euler": {"order": "symplectic"},
-        "projection, for periodic flows": Projection(**validation.PERIODIC_PROJECTION),
-    } | REFERENCE, "relative L2 velocity error"),
-    "space": Flow(space, WeaklyCompressible(**validation.PERIODIC_OPTIONS_3D), (16, 20, 24), (16,), {
-        "options for periodic flows": {}, "sound speed 20": {"sound_speed": 20.0},
-        "Wendland C4, h = 2.2": SMOOTHER | {"smoothing_ratio": 2.2}, "h = 1.4": {"smoothing_ratio": 1.4},
-        "shifting 8": {"shifting": 8.0},
-        "projection, for periodic flows": Projection(**validation.PERIODIC_PROJECTION_3D),
-    }, "error of the kinetic energy"),
-    "channel": Flow(poiseuille, WeaklyCompressible(**validation.CHANNEL_OPTIONS), (10, 20, 40), (10, 20), {
-        "options for channels": {}, "sound speed 20": {"sound_speed": 20.0}, "Wendland C4, h = 2.4": SMOOTHER,
-        "h = 1.3": {"smoothing_ratio": 1.3}, "position Verlet": {"order": "verlet"},
-        "potential wall": {"wall": PotentialWall()},
-    } | REFERENCE, "RMS error / largest velocity"),
+    "plane": Flow(
+        plane,
+        WeaklyCompressible(**validation.PERIODIC_OPTIONS),
+        (20, 40, 60),
+        (16, 24),
+        {
+            "options for periodic flows": {},
+            "sound speed 20": {"sound_speed": 20.0},
+            "sound speed 7": {"sound_speed": 7.0},
+            "quintic, h = 1.5": FINER,
+            "Wendland C4, h = 2.4": SMOOTHER,
+            "h = 1.6": {"smoothing_ratio": 1.6},
+            "predictor-corrector": {"order": "predictor_corrector"},
+            "symplectic Euler": {"order": "symplectic"},
+            "projection, for periodic flows": Projection(**validation.PERIODIC_PROJECTION),
+        }
+        | REFERENCE,
+        "relative L2 velocity error",
+    ),
+    "space": Flow(
+        space,
+        WeaklyCompressible(**validation.PERIODIC_OPTIONS_3D),
+        (16, 20, 24),
+        (16,),
+        {
+            "options for periodic flows": {},
+            "sound speed 20": {"sound_speed": 20.0},
+            "Wendland C4, h = 2.2": SMOOTHER | {"smoothing_ratio": 2.2},
+            "h = 1.4": {"smoothing_ratio": 1.4},
+            "shifting 8": {"shifting": 8.0},
+            "projection, for periodic flows": Projection(**validation.PERIODIC_PROJECTION_3D),
+        },
+        "error of the kinetic energy",
+    ),
+    "channel": Flow(
+        poiseuille,
+        WeaklyCompressible(**validation.CHANNEL_OPTIONS),
+        (10, 20, 40),
+        (10, 20),
+        {
+            "options for channels": {},
+            "sound speed 20": {"sound_speed": 20.0},
+            "Wendland C4, h = 2.4": SMOOTHER,
+            "h = 1.3": {"smoothing_ratio": 1.3},
+            "position Verlet": {"order": "verlet"},
+            "potential wall": {"wall": PotentialWall()},
+        }
+        | REFERENCE,
+        "RMS error / largest velocity",
+    ),
     "pipe": Flow(
-        pipe, WeaklyCompressible(sound_speed=10.0, artificial_viscosity=None), (10, 16, 20), (10,),
+        pipe,
+        WeaklyCompressible(sound_speed=10.0, artificial_viscosity=None),
+        (10, 16, 20),
+        (10,),
         {"sound speed 10": {}, "projection, for periodic flows": Projection(**validation.PERIODIC_PROJECTION)},
         "relative L2 velocity error",
     ),
     "ellipsoid": Flow(
-        ellipsoid, preset("weakly_compressible"), (12, 16, 20), (10,), {}, "relative L2 error of the core",
+        ellipsoid,
+        preset("weakly_compressible"),
+        (12, 16, 20),
+        (10,),
+        {},
+        "relative L2 error of the core",
     ),
-    "ventricle": Flow(ventricle, preset("weakly_compressible"), (1.5, 1.2, 1.0), (2.5,), {
-        "projection": preset("projection"),
-        "projection, steps to 1 ms": preset("projection", max_step=1e-3, courant=0.6),
-        "projection, steps to 0.5 ms": preset("projection", max_step=5e-4, courant=0.27),
-        "sound speed 3.5": {"sound_speed": 3.5}, "sound speed 10": {"sound_speed": 10.0},
-        "gamma from 1 to 7 in 10 ms": {"gamma": 7.0, "gamma_ramp": GammaRamp()},
-    }, "error / error of persistence", " mm"),
-}  # fmt: skip
+    "ventricle": Flow(
+        ventricle,
+        preset("weakly_compressible"),
+        (1.5, 1.2, 1.0),
+        (2.5,),
+        {
+            "projection": preset("projection"),
+            "projection, steps to 1 ms": preset("projection", max_step=1e-3, courant=0.6),
+            "projection, steps to 0.5 ms": preset("projection", max_step=5e-4, courant=0.27),
+            "sound speed 3.5": {"sound_speed": 3.5},
+            "sound speed 10": {"sound_speed": 10.0},
+            "gamma from 1 to 7 in 10 ms": {"gamma": 7.0, "gamma_ramp": GammaRamp()},
+        },
+        "error / error of persistence",
+        " mm",
+    ),
+}
 
 
 def measured(name: str, flow: Flow, quick: bool) -> list[dict]:
@@ -243,10 +292,17 @@ def measured(name: str, flow: Flow, quick: bool) -> list[dict]:
             scheme = replace(flow.base, **{k: v for k, v in changes.items() if k != "backend"})
         for size in sizes[:1] if curve in flow.slow and backend == "reference" else sizes:
             error, cpu, wall, steps = flow.measure(size, scheme, backend, quick)
-            rows.append({
-                "flow": name, "curve": curve, "resolution": size, "error": error, "cpu_s": cpu, "wall_s": wall,
-                "step_per_s": steps / cpu,
-            })  # fmt: skip
+            rows.append(
+                {
+                    "flow": name,
+                    "curve": curve,
+                    "resolution": size,
+                    "error": error,
+                    "cpu_s": cpu,
+                    "wall_s": wall,
+                    "step_per_s": steps / cpu,
+                }
+            )
             print(f"{name:<10} {curve:<28} {size:>5g} {error:>8.4f} {cpu:>7.2f} {steps / cpu / 1e6:>9.3f}", flush=True)
     return rows
 

@@ -30,9 +30,7 @@ import torch
 
 import regularize as rg
 
-AXES = torch.tensor(
-    [40e-3, 20e-3, 20e-3], dtype=torch.float64
-)  # semi-axes of the ventricle-like ellipsoid, m
+AXES = torch.tensor([40e-3, 20e-3, 20e-3], dtype=torch.float64)  # semi-axes of the ventricle-like ellipsoid, m
 TOLERANCE = 1e-6
 SCIPY_SAMPLE = 40  # iterations timed where a full SciPy run would take many minutes
 
@@ -59,10 +57,7 @@ def system(samples: int, nodes: tuple[int, ...], seed: int = 0) -> rg.System:
         tuple(n - 3 for n in nodes),
     )
     points = inside(samples, generator)
-    weight = (
-        torch.rand(samples, 1, generator=torch.Generator().manual_seed(seed + 1), dtype=torch.float64) * 0.9
-        + 0.1
-    )
+    weight = torch.rand(samples, 1, generator=torch.Generator().manual_seed(seed + 1), dtype=torch.float64) * 0.9 + 0.1
     noise = 0.1 * torch.randn(samples, 3, generator=generator, dtype=torch.float64)
     wall = torch.randn(2000, 3, generator=generator, dtype=torch.float64)
     wall = wall / wall.norm(dim=1, keepdim=True)
@@ -72,9 +67,7 @@ def system(samples: int, nodes: tuple[int, ...], seed: int = 0) -> rg.System:
     blocks = [
         rg.VectorRows(knots, points, flow(points) + noise, weight),
         rg.DivergenceRows(knots, inside(samples, generator), 3, strength),
-        rg.DirectionRows(
-            knots, on_wall, normals, (normals * flow(on_wall)).sum(1), torch.full((2000,), 200**0.5)
-        ),
+        rg.DirectionRows(knots, on_wall, normals, (normals * flow(on_wall)).sum(1), torch.full((2000,), 200**0.5)),
     ]
     return rg.System(knots, 3, blocks, 0.5**0.5)
 

@@ -112,9 +112,7 @@ def shear(quick: bool) -> dict[str, Rows]:
         tracker = SpeckleTracker(clutter=clutter)
 
         def run(rate: float, tracker: SpeckleTracker = tracker) -> tuple:
-            return errors(
-                (0.2, 0.1, 0.25), tracker, 1 if quick else 3, gradient=((0,) * 3, (0,) * 3, (rate, 0, 0))
-            )
+            return errors((0.2, 0.1, 0.25), tracker, 1 if quick else 3, gradient=((0,) * 3, (0,) * 3, (rate, 0, 0)))
 
         rows[name] = sweep(values, f"{name}: shear (1/s)", run)
     return rows
@@ -208,10 +206,7 @@ def decibel(power: np.ndarray) -> np.ndarray:
     return 10 * np.log10(np.maximum(power, 1e-12))
 
 
-PARTS = {
-    part.__name__: part
-    for part in (speed, angle, shear, snr, clutter, dropout, memory, calibration, response)
-}  # fmt: skip
+PARTS = {part.__name__: part for part in (speed, angle, shear, snr, clutter, dropout, memory, calibration, response)}
 
 
 def main() -> None:

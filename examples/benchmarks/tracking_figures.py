@@ -1,6 +1,6 @@
 """Figures of examples/benchmarks/tracking.py: errors against what makes them, and the filters' responses.
 
-    python examples/benchmarks/tracking_figures.py RESULTS.json --out FOLDER
+python examples/benchmarks/tracking_figures.py RESULTS.json --out FOLDER
 """
 
 from __future__ import annotations
@@ -18,9 +18,13 @@ import numpy as np
 from torchsph.ultrasound import FIRFilter, PolynomialFilter
 
 AXES = {
-    "speed": "speed (m/s)", "angle": "angle to the beam (degrees)", "shear": "shear (1/s)", "snr": "SNR (dB)",
-    "clutter": "clutter over blood (dB)", "dropout": "axial speed (m/s), FIR filter",
-}  # fmt: skip
+    "speed": "speed (m/s)",
+    "angle": "angle to the beam (degrees)",
+    "shear": "shear (1/s)",
+    "snr": "SNR (dB)",
+    "clutter": "clutter over blood (dB)",
+    "dropout": "axial speed (m/s), FIR filter",
+}
 COMPONENTS = ("x (across)", "y (across)", "z (along)")
 
 

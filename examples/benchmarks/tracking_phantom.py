@@ -43,12 +43,14 @@ def calibration(measured: geometry.Recording, true: geometry.Recording) -> dict:
         score = error / measured.sigma.transpose(0, 2, 3, 4, 1)[seen]
         weight = torch.from_numpy(measured.weight[seen])
         rows[name] = {
-            "accepted": round(float(seen.sum() / place.sum()), 3), "points": int(seen.sum()),
-            "bias": error.mean(0).round(4).tolist(), "std": error.std(0).round(4).tolist(),
+            "accepted": round(float(seen.sum() / place.sum()), 3),
+            "points": int(seen.sum()),
+            "bias": error.mean(0).round(4).tolist(),
+            "std": error.std(0).round(4).tolist(),
             "median": np.median(np.abs(error), axis=0).round(4).tolist(),
             "outliers": round(float((np.linalg.norm(error, axis=1) > 0.3).mean()), 4),
             "z-scores by third of the weight": terciles(torch.from_numpy(score), weight),
-        }  # fmt: skip
+        }
     return rows
 
 
@@ -71,8 +73,11 @@ def draw(path: Path, true: geometry.Recording, measured: geometry.Recording, qua
     if quarter:
         plane = replace(plane, across=np.cross(plane.along, plane.across))
     shown = replace(measured, mask=measured.mask & (measured.weight > 0))
-    rows = (("true", true, true.velocity), ("tracked", shown, shown.velocity),
-            ("error", shown, shown.velocity - true.velocity))  # fmt: skip
+    rows = (
+        ("true", true, true.velocity),
+        ("tracked", shown, shown.velocity),
+        ("error", shown, shown.velocity - true.velocity),
+    )
     columns = min(COLUMNS, len(measured.time))
     lines = -(-len(measured.time) // columns)
     figure, axes = plt.subplots(3 * lines, columns, figsize=(1.45 * columns + 1, 6.6 * lines), squeeze=False)
@@ -86,9 +91,13 @@ def draw(path: Path, true: geometry.Recording, measured: geometry.Recording, qua
             image = axis.pcolormesh(1e3 * picture.across, 1e3 * picture.along, picture.speed, vmin=0, vmax=top)
             every = (slice(None, None, 3),) * 2
             axis.quiver(
-                1e3 * picture.across[::3], 1e3 * picture.along[::3], *(part[every] for part in picture.velocity),
-                color="white", scale=8 * top, width=6e-3,
-            )  # fmt: skip
+                1e3 * picture.across[::3],
+                1e3 * picture.along[::3],
+                *(part[every] for part in picture.velocity),
+                color="white",
+                scale=8 * top,
+                width=6e-3,
+            )
             for segment in picture.outline:
                 axis.plot(*(1e3 * segment.T), "k", lw=0.8)
             axis.set_aspect("equal")

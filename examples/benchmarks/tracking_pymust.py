@@ -89,10 +89,19 @@ def main() -> None:
     print(json.dumps(statistics, indent=1))
     if arguments.out:
         np.savez_compressed(
-            arguments.out, point=point.astype(np.complex64), image=scanner.image(x, z, amplitude).astype(np.complex64),
-            x=x, z=z, amplitude=amplitude, step=STEP, depth=DEPTH, frequency=scanner.array.fc,
-            sound_speed=scanner.array.c, version="PyMUST 0.1.9", **statistics,
-        )  # fmt: skip
+            arguments.out,
+            point=point.astype(np.complex64),
+            image=scanner.image(x, z, amplitude).astype(np.complex64),
+            x=x,
+            z=z,
+            amplitude=amplitude,
+            step=STEP,
+            depth=DEPTH,
+            frequency=scanner.array.fc,
+            sound_speed=scanner.array.c,
+            version="PyMUST 0.1.9",
+            **statistics,
+        )
     if arguments.json:
         arguments.json.write_text(json.dumps(statistics, indent=1))
 

@@ -106,9 +106,7 @@ def rivals(quick: bool) -> dict[str, float]:
     """Milliseconds per point, and how many times as fast the same search is here."""
     half = 2 if quick else 6
     points, grid = lattice(half), image_grid(6 * half + 6)
-    packet = simulate_packet(
-        LinearFlow((0.3, 0.2, 0.25)), grid, EchoModel(), 0.0, torch.Generator().manual_seed(0)
-    )
+    packet = simulate_packet(LinearFlow((0.3, 0.2, 0.25)), grid, EchoModel(), 0.0, torch.Generator().manual_seed(0))
     same = SpeckleTracker(clutter=None, lags=(1,), follow_shear=False, phase=False)
     full = SpeckleTracker(clutter=None)
     few, counts, programs = points[:: len(points) // 12], {}, {}

@@ -63,9 +63,10 @@ from torchsph.validation_ellipsoid import PulsatingEllipsoid
 from torchsph.wallfield import WallFields
 
 WALLS = {
-    "complete kernel": CompleteKernelWall(), "potential, no slip": PotentialWall(),
+    "complete kernel": CompleteKernelWall(),
+    "potential, no slip": PotentialWall(),
     "potential, free slip": PotentialWall(relaxation=None),
-}  # fmt: skip
+}
 RADIUS, VISCOSITY = 0.5, 0.1
 FORCE = 4 * VISCOSITY / RADIUS**2  # 1 m/s on the axis
 
@@ -78,9 +79,12 @@ def steady_pipe(
     tube = geometry.tube(RADIUS, (length + 14) * spacing, 0.5 * spacing)
     tube = tube.moved(tube.vertices - np.array([0, 0, 7 * spacing]))
     scene = Scene(
-        spacing=spacing, fluid=Fluid(1.0, VISCOSITY), walls=geometry.WallMotion.at_rest(tube),
-        period=(None, None, length * spacing), gravity=(0.0, 0.0, FORCE),
-    )  # fmt: skip
+        spacing=spacing,
+        fluid=Fluid(1.0, VISCOSITY),
+        walls=geometry.WallMotion.at_rest(tube),
+        period=(None, None, length * spacing),
+        gravity=(0.0, 0.0, FORCE),
+    )
     run = Simulator(scene, scheme, backend=backend).start(0.0)
 
     def exact() -> torch.Tensor:
@@ -100,9 +104,7 @@ def steady_pipe(
 
 def pipe(wall: object, duration: float, across: int = 16, length: int = 10) -> dict[str, float]:
     """Velocity error of steady pipe flow."""
-    run, error = steady_pipe(
-        WeaklyCompressible(sound_speed=10.0, artificial_viscosity=None, wall=wall), across, length
-    )
+    run, error = steady_pipe(WeaklyCompressible(sound_speed=10.0, artificial_viscosity=None, wall=wall), across, length)
     run.advance(duration)
     return {"velocity": error(), "outside": int(run.record.outside)}
 
@@ -120,9 +122,11 @@ def at_rest(name: str, wall: object, duration: float, across: int = 12) -> dict[
     surface = container(name, 1 / across)
     height = float(np.ptp(surface.vertices[:, 2]))
     scene = Scene(
-        spacing=1 / across, fluid=Fluid(1.0, 0.05), walls=geometry.WallMotion.at_rest(surface),
+        spacing=1 / across,
+        fluid=Fluid(1.0, 0.05),
+        walls=geometry.WallMotion.at_rest(surface),
         gravity=(0.0, 0.0, -1.0),
-    )  # fmt: skip
+    )
     scheme = WeaklyCompressible(sound_speed=10.0, wall=wall)
     run = Simulator(scene, scheme).start(0.0)
     run.advance(duration)
@@ -130,7 +134,8 @@ def at_rest(name: str, wall: object, duration: float, across: int = 12) -> dict[
     error = p.deviation.double() * scheme.sound_speed**2 + p.position[:, 2].double() / across
     return {
         "pressure": float((error - error.mean()).square().mean().sqrt()) / height,
-        "speed": float(p.velocity.norm(dim=1).amax()) / height**0.5, "outside": int(run.record.outside),
+        "speed": float(p.velocity.norm(dim=1).amax()) / height**0.5,
+        "outside": int(run.record.outside),
     }
 
 
@@ -228,8 +233,9 @@ def main() -> None:
         print(
             f"{name:<22} {row['pipe']['velocity']:>7.2%} {row['sphere']['pressure']:>9.2%} "
             f"{row['sphere']['speed']:>7.2%} {row['tilted box']['pressure']:>7.2%} {row['tilted box']['speed']:>7.2%} "
-            f"{row['step']['part']:>13.1%}", flush=True,
-        )  # fmt: skip
+            f"{row['step']['part']:>13.1%}",
+            flush=True,
+        )
     out["fields"] = fields(2 if quick else 5)
     made = out["fields"]
     print(

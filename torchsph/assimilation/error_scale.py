@@ -32,9 +32,7 @@ class ErrorScale:
     It remembers: `state` and `restore` belong in a checkpoint.
     """
 
-    def __init__(
-        self, groups: int = 1, *, memory: float = 20.0, smallest: float = 0.01, largest: float = 1e4
-    ) -> None:
+    def __init__(self, groups: int = 1, *, memory: float = 20.0, smallest: float = 0.01, largest: float = 1e4) -> None:
         if groups < 1 or not memory >= 1 or not 0 < smallest < largest:
             raise AssimilationError("ErrorScale needs groups >= 1, memory >= 1 and 0 < smallest < largest")
         self.memory, self.smallest, self.largest = memory, smallest, largest

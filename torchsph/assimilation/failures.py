@@ -72,8 +72,7 @@ def replace_failed(
         drawn = (1 - share) ** 0.5 * drawn + share**0.5 * size * new
     start = int(torch.randint(len(survivors), (1,), generator=generator, device=generator.device))
     events = tuple(
-        Replacement(int(member), int(survivors[(start + k) % len(survivors)]))
-        for k, member in enumerate(lost)
+        Replacement(int(member), int(survivors[(start + k) % len(survivors)])) for k, member in enumerate(lost)
     )
     whole = ensemble.clone()
     whole[lost] = (living.mean(0) + drawn).to(ensemble.dtype)

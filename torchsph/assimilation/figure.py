@@ -32,9 +32,7 @@ def filter_figure(summary: dict) -> Figure:
 def _spread(axes: Axes, cycles: list[dict]) -> None:
     time = [cycle["time"] for cycle in cycles]
     axes.plot(time, [cycle["spread_before"] for cycle in cycles], color="C0", label="spread, forecast")
-    axes.plot(
-        time, [cycle["spread_after"] for cycle in cycles], color="C0", ls="--", label="spread, analysis"
-    )
+    axes.plot(time, [cycle["spread_after"] for cycle in cycles], color="C0", ls="--", label="spread, analysis")
     known = [cycle for cycle in cycles if "error" in cycle]
     if known:
         axes.plot(

@@ -236,9 +236,7 @@ class EnsembleFilter(ABC):
         batch = tuple(ensemble.shape[:-2])
         return random_rotation(ensemble.shape[-2], draw, batch=batch, device=ensemble.device)
 
-    def _finish(
-        self, ensemble: Tensor, factor: Tensor, transform: Transform, rotation: Tensor | None
-    ) -> Tensor:
+    def _finish(self, ensemble: Tensor, factor: Tensor, transform: Transform, rotation: Tensor | None) -> Tensor:
         """Prior inflation, transform, posterior inflation and rotation of the state, float64."""
         wide = ensemble.double()
         mean = self._mean(wide).unsqueeze(-2)
@@ -263,9 +261,7 @@ def check_ensemble(ensemble: Tensor, predicted: Tensor, observations: Observatio
             f"{tuple(ensemble.shape[:-1])}"
         )
     if predicted.shape[-1] != len(observations):
-        raise AssimilationError(
-            f"{predicted.shape[-1]} predicted observations for {len(observations)} observations"
-        )
+        raise AssimilationError(f"{predicted.shape[-1]} predicted observations for {len(observations)} observations")
     bad = ~torch.isfinite(ensemble).all(-1)
     if bool(bad.any()):
         raise AssimilationError(

@@ -104,9 +104,7 @@ class Adaptive:
     It remembers: `state()` and `restore()` belong into a checkpoint. `smallest` and `largest` bound it.
     """
 
-    def __init__(
-        self, *, start: float = 1.0, drift: float = 0.03, smallest: float = 1.0, largest: float = 3.0
-    ) -> None:
+    def __init__(self, *, start: float = 1.0, drift: float = 0.03, smallest: float = 1.0, largest: float = 3.0) -> None:
         if not (drift > 0 and 0 < smallest <= start <= largest):
             raise AssimilationError("Adaptive needs drift > 0 and 0 < smallest <= start <= largest")
         self.drift, self.smallest, self.largest = drift, smallest, largest

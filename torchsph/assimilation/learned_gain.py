@@ -84,8 +84,10 @@ class LearnedGain:
         self._right = kept * self._right + right + normal @ self._weight
         self._normal = kept * self._normal + normal
         shared = self._pool.mT @ _solved(
-            self._pool @ self._normal @ self._pool.mT, self._pool @ self._right,
-            self._pool @ self._weight / self._pool.sum(1), _RIDGE,
+            self._pool @ self._normal @ self._pool.mT,
+            self._pool @ self._right,
+            self._pool @ self._weight / self._pool.sum(1),
+            _RIDGE,
         )
         self._weight = _solved(self._normal, self._right, shared.clamp(0.0, 1.0), _TOGETHER).clamp(0.0, 1.0)
 

@@ -91,13 +91,9 @@ class LETKF(EnsembleFilter):
 def _located(target: Target, observations: Observations) -> Tensor:
     """`(n,)` which state variables have a place; raises where places are missing altogether."""
     if target.positions is None or observations.position is None:
-        raise AssimilationError(
-            "the LETKF needs places: pass state_positions=... and Observations(position=...)"
-        )
+        raise AssimilationError("the LETKF needs places: pass state_positions=... and Observations(position=...)")
     if not len(target.positions) or target.size % len(target.positions):
-        raise AssimilationError(
-            f"{len(target.positions)} state positions do not divide a state of {target.size}"
-        )
+        raise AssimilationError(f"{len(target.positions)} state positions do not divide a state of {target.size}")
     located = torch.isfinite(_spread_out(target)).all(-1)
     if not bool(located.any()):
         raise AssimilationError("no state variable has a finite position")
@@ -134,9 +130,7 @@ class LocalTransform:
     reached: Tensor | None
 
     @classmethod
-    def of(
-        cls, weights: Tensor, informed: Tensor, state: Groups, located: Tensor, basis: Tensor
-    ) -> LocalTransform:
+    def of(cls, weights: Tensor, informed: Tensor, state: Groups, located: Tensor, basis: Tensor) -> LocalTransform:
         """With `informed (*batch, P)` marking the places that any observation reaches."""
         number = informed.sum(-1).clamp(min=1)[..., None, None]
         average = torch.where(informed[..., None, None], weights, 0.0).sum(-3) / number

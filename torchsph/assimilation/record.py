@@ -72,9 +72,11 @@ class FilterRecord:
     def state(self) -> dict:
         """What a checkpoint has to hold."""
         return {
-            "cycles": list(self.cycles), "histogram": self._histogram, "warnings": dict(self._warnings),
+            "cycles": list(self.cycles),
+            "histogram": self._histogram,
+            "warnings": dict(self._warnings),
             "innovations": {name: list(parts) for name, parts in self._innovations.items()},
-        }  # fmt: skip
+        }
 
     def restore(self, state: dict) -> None:
         self.cycles, self._histogram = list(state["cycles"]), state["histogram"]

@@ -47,9 +47,11 @@ class ReducedUnscented(EnsembleFilter):
     ) -> Analysis:
         """See `Filter.analyse`; `ensemble` and `predicted` are sigma points in the order of the rule."""
         return super().analyse(
-            *self._kept(ensemble, predicted, observations), observations, state_positions=state_positions,
+            *self._kept(ensemble, predicted, observations),
+            observations,
+            state_positions=state_positions,
             generator=generator,
-        )  # fmt: skip
+        )
 
     def screen(self, ensemble: Tensor, predicted: Tensor, observations: Observations) -> Screened:
         """See `Filter.screen`."""

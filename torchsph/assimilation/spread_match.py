@@ -25,9 +25,7 @@ class SpreadMatch:
     It remembers: `state` and `restore` belong in a checkpoint.
     """
 
-    def __init__(
-        self, *, memory: float = 2.0, lasting: float = 6.0, averaged: float = 8.0, most: float = 4.0
-    ) -> None:
+    def __init__(self, *, memory: float = 2.0, lasting: float = 6.0, averaged: float = 8.0, most: float = 4.0) -> None:
         """`averaged`: cycles whose increments and variances tell what an analysis leaves. `most`: the largest ratio of
         variances that one cycle is believed to show, and the largest factor."""
         if not min(memory, lasting, averaged) >= 1 or not most > 1:
@@ -40,8 +38,13 @@ class SpreadMatch:
         self._taken, self._before = 0.0, 0.0
 
     def state(self) -> dict[str, float]:
-        return {"factor": self.factor, "now": self.now, "cycles": self.cycles, "taken": self._taken,
-                "before": self._before}  # fmt: skip
+        return {
+            "factor": self.factor,
+            "now": self.now,
+            "cycles": self.cycles,
+            "taken": self._taken,
+            "before": self._before,
+        }
 
     def restore(self, state: dict[str, float]) -> None:
         self.factor, self.now, self.cycles = state["factor"], state["now"], state["cycles"]

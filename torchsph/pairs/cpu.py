@@ -134,18 +134,35 @@ class CpuBackend(PlannedBackend):
         )
 
     def poisson(
-        self, pairs: ClusterPairs, state: PairState, support: Support, source: Tensor, start: Tensor | None, *,
-        free: Tensor, active: Tensor, singular: Tensor, tolerance: float, iterations: int, group: Tensor | None = None,
+        self,
+        pairs: ClusterPairs,
+        state: PairState,
+        support: Support,
+        source: Tensor,
+        start: Tensor | None,
+        *,
+        free: Tensor,
+        active: Tensor,
+        singular: Tensor,
+        tolerance: float,
+        iterations: int,
+        group: Tensor | None = None,
     ) -> PoissonSolution:
         self.check(state.position, source, *(() if start is None else (start,)))
         self._check_state(pairs, state)
         kind, numbers = plan.kernel_choice(support, self.name)
         group = state.member if group is None else group
         values, count, residual, converged, mismatch = operators.poisson(
-            pairs.lists, pairs.period, kind, numbers, plan.coefficients(support, None, pairs.members),
+            pairs.lists,
+            pairs.period,
+            kind,
+            numbers,
+            plan.coefficients(support, None, pairs.members),
             *(t.contiguous() for t in (state.position, state.mass, state.deviation, group, source)),
             None if start is None else start.contiguous(),
-            *(t.contiguous() for t in (free, active, singular)), tolerance, iterations,
+            *(t.contiguous() for t in (free, active, singular)),
+            tolerance,
+            iterations,
         )
         return PoissonSolution(values, count, residual, converged, mismatch)
 
@@ -169,7 +186,12 @@ class CpuBackend(PlannedBackend):
         tensors = (t.detach().contiguous() for t in (position, member, fields, query, query_member))
         return Moments(
             *operators.interpolation_moments(
-                *tensors, support.radius, lengths(period, position.shape[1]), kind, numbers, smoothing,
+                *tensors,
+                support.radius,
+                lengths(period, position.shape[1]),
+                kind,
+                numbers,
+                smoothing,
                 None if weight is None else weight.contiguous(),
             )
         )

@@ -95,9 +95,7 @@ def cluster_lists(
     return [slot, owner, offset, home, needed]
 
 
-def _search_arguments(
-    position: Tensor, member: Tensor, radius: float, period: Sequence[float]
-) -> SearchArguments:
+def _search_arguments(position: Tensor, member: Tensor, radius: float, period: Sequence[float]) -> SearchArguments:
     return SearchArguments(
         position.shape[0],
         position.data_ptr(),
@@ -166,27 +164,68 @@ def pair_pass(
 
 
 def _pass_arguments(
-    lists: Sequence[Tensor], period: Sequence[float], choice: Sequence[int], kernel: Sequence[float],
-    coefficients: Tensor, position: Tensor, velocity: Tensor | None, mass: Tensor, deviation: Tensor,
-    pressure: Tensor | None = None, slope: Tensor | None = None, field: Tensor | None = None,
+    lists: Sequence[Tensor],
+    period: Sequence[float],
+    choice: Sequence[int],
+    kernel: Sequence[float],
+    coefficients: Tensor,
+    position: Tensor,
+    velocity: Tensor | None,
+    mass: Tensor,
+    deviation: Tensor,
+    pressure: Tensor | None = None,
+    slope: Tensor | None = None,
+    field: Tensor | None = None,
     active: Tensor | None = None,
 ) -> PassArguments:
     slot, owner, entries, offset, home = lists
     terms, weight, form, kind = choice
     return PassArguments(
-        dimension=position.shape[1], threads=torch.get_num_threads(), terms=terms, weight=weight, form=form,
-        kernel=kind, support=kernel[0], sigma=kernel[1], particles=position.shape[0], clusters=owner.shape[0],
-        slot=slot.data_ptr(), owner=owner.data_ptr(), entries=entries.data_ptr(), offset=offset.data_ptr(),
-        home=home.data_ptr() if home.numel() else None, period=_period(period), coefficients=coefficients.data_ptr(),
-        position=position.data_ptr(), velocity=address(velocity), mass=mass.data_ptr(), deviation=deviation.data_ptr(),
-        pressure=address(pressure), slope=address(slope), field=address(field), active=address(active),
+        dimension=position.shape[1],
+        threads=torch.get_num_threads(),
+        terms=terms,
+        weight=weight,
+        form=form,
+        kernel=kind,
+        support=kernel[0],
+        sigma=kernel[1],
+        particles=position.shape[0],
+        clusters=owner.shape[0],
+        slot=slot.data_ptr(),
+        owner=owner.data_ptr(),
+        entries=entries.data_ptr(),
+        offset=offset.data_ptr(),
+        home=home.data_ptr() if home.numel() else None,
+        period=_period(period),
+        coefficients=coefficients.data_ptr(),
+        position=position.data_ptr(),
+        velocity=address(velocity),
+        mass=mass.data_ptr(),
+        deviation=deviation.data_ptr(),
+        pressure=address(pressure),
+        slope=address(slope),
+        field=address(field),
+        active=address(active),
     )
 
 
 def poisson(
-    lists: Sequence[Tensor], period: Sequence[float], kind: int, kernel: Sequence[float], coefficients: Tensor,
-    position: Tensor, mass: Tensor, deviation: Tensor, group: Tensor, source: Tensor, start: Tensor | None,
-    free: Tensor, active: Tensor | None, singular: Tensor, tolerance: float, iterations: int,
+    lists: Sequence[Tensor],
+    period: Sequence[float],
+    kind: int,
+    kernel: Sequence[float],
+    coefficients: Tensor,
+    position: Tensor,
+    mass: Tensor,
+    deviation: Tensor,
+    group: Tensor,
+    source: Tensor,
+    start: Tensor | None,
+    free: Tensor,
+    active: Tensor | None,
+    singular: Tensor,
+    tolerance: float,
+    iterations: int,
 ) -> list[Tensor]:
     """Conjugate gradients for the Laplacian of the cluster lists; arguments as in ``Backend.poisson``.
 
@@ -197,17 +236,25 @@ def poisson(
     """
     groups = singular.shape[0]
     choice = [plan.LAPLACIAN, plan.BY_VOLUME, 0, kind]
-    given = _pass_arguments(
-        lists, period, choice, kernel, coefficients, position, None, mass, deviation, active=active
-    )
+    given = _pass_arguments(lists, period, choice, kernel, coefficients, position, None, mass, deviation, active=active)
     values, converged = torch.empty_like(source), torch.empty(groups, dtype=torch.bool)
     count = torch.empty(groups, dtype=torch.int64)
     residual, mismatch = (torch.empty(groups, dtype=torch.float64) for _ in range(2))
     arguments = PoissonArguments(
-        pass_=given, source=source.data_ptr(), start=address(start), free=free.data_ptr(),
-        singular=singular.data_ptr(), member=group.data_ptr(), members=groups, iterations=iterations,
-        tolerance=tolerance, values=values.data_ptr(), count=count.data_ptr(), residual=residual.data_ptr(),
-        mismatch=mismatch.data_ptr(), converged=converged.data_ptr(),
+        pass_=given,
+        source=source.data_ptr(),
+        start=address(start),
+        free=free.data_ptr(),
+        singular=singular.data_ptr(),
+        member=group.data_ptr(),
+        members=groups,
+        iterations=iterations,
+        tolerance=tolerance,
+        values=values.data_ptr(),
+        count=count.data_ptr(),
+        residual=residual.data_ptr(),
+        mismatch=mismatch.data_ptr(),
+        converged=converged.data_ptr(),
     )
     library().function("poisson", REALS[position.dtype])(ctypes.byref(arguments))
     return [values, count, residual, converged, mismatch]
@@ -266,9 +313,7 @@ def interpolation_moments(
     )
     unusable = library().function("interpolate", REALS[position.dtype])(ctypes.byref(arguments))
     if unusable:
-        raise ValueError(
-            f"{unusable} particle or query positions are not finite, or their member does not exist"
-        )
+        raise ValueError(f"{unusable} particle or query positions are not finite, or their member does not exist")
     return outputs
 
 

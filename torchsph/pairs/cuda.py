@@ -174,9 +174,21 @@ def triton_blocks(count: int, block: int) -> int:
 
 _OLDEST_TRITON = (3, 3)  # the first whose kernels may hold tuples
 _TERMS = (
-    "CONTINUITY", "DIFFUSION", "CONCENTRATION", "XSPH", "PRESSURE", "ARTIFICIAL", "LAMINAR", "TENSILE",
-    "SHEPARD", "RENORMALISATION", "LAPLACIAN", "GRADIENT", "CORRECTED_DIFFUSION", "MOMENTS",
-)  # fmt: skip
+    "CONTINUITY",
+    "DIFFUSION",
+    "CONCENTRATION",
+    "XSPH",
+    "PRESSURE",
+    "ARTIFICIAL",
+    "LAMINAR",
+    "TENSILE",
+    "SHEPARD",
+    "RENORMALISATION",
+    "LAPLACIAN",
+    "GRADIENT",
+    "CORRECTED_DIFFUSION",
+    "MOMENTS",
+)
 _ROWS = ("WEIGHT", "STRESS", "INERTIA", "INVERSE", "DEVIATION", "MASS", "FIELD", "SLOPE")
 
 
@@ -201,9 +213,7 @@ def _pack(
     if field is not None:
         quantities["FIELD"] = field
     if request.terms & plan.CORRECTED_DIFFUSION:
-        quantities |= {
-            name: part for name, part in zip(("SLOPE", "SLOPE_Y", "SLOPE_Z"), state.slope.T, strict=False)
-        }
+        quantities |= {name: part for name, part in zip(("SLOPE", "SLOPE_Y", "SLOPE_Z"), state.slope.T, strict=False)}
     quantities["FACTOR"] = 1.0 / density if by_volume else torch.ones_like(density)
     if field is not None:
         quantities["FACTOR"] = torch.ones_like(density) if active is None else active.to(density.dtype)

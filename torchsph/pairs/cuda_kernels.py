@@ -91,9 +91,13 @@ def matrix_sum(total, factor, a):
     y = factor * a[1]
     z = factor * a[2]
     return (
-        total[0] + x * a[0], total[1] + x * a[1], total[2] + x * a[2],
-        total[3] + y * a[1], total[4] + y * a[2], total[5] + z * a[2],
-    )  # fmt: skip
+        total[0] + x * a[0],
+        total[1] + x * a[1],
+        total[2] + x * a[2],
+        total[3] + y * a[1],
+        total[4] + y * a[2],
+        total[5] + z * a[2],
+    )
 
 
 @triton.jit
@@ -153,9 +157,17 @@ def separation(place, other, period, PERIODIC: tl.constexpr, D: tl.constexpr):
 
 @triton.jit
 def central_push(
-    stress, other, value, approach, viscosity, distance,
-    PRESSURE: tl.constexpr, ARTIFICIAL: tl.constexpr, TENSILE: tl.constexpr, tensile,
-):  # fmt: skip
+    stress,
+    other,
+    value,
+    approach,
+    viscosity,
+    distance,
+    PRESSURE: tl.constexpr,
+    ARTIFICIAL: tl.constexpr,
+    TENSILE: tl.constexpr,
+    tensile,
+):
     """Pressure and artificial viscosity of a pair along its gap, before the kernel's slope."""
     push = 0.0 * value
     if PRESSURE:
@@ -169,15 +181,46 @@ def central_push(
 
 @triton.jit
 def pair_sums(
-    fields, own_stress, out, coefficients, member, start, stop, periods, support, count,
-    D: tl.constexpr, KERNEL: tl.constexpr, RANGES: tl.constexpr, PERIODIC: tl.constexpr, BLOCK: tl.constexpr,
-    JUMPS: tl.constexpr, APPROACH: tl.constexpr, CONTINUITY: tl.constexpr, DIFFUSION: tl.constexpr,
-    CONCENTRATION: tl.constexpr, XSPH: tl.constexpr, PRESSURE: tl.constexpr, ARTIFICIAL: tl.constexpr,
-    LAMINAR: tl.constexpr, TENSILE: tl.constexpr, SHEPARD: tl.constexpr, RENORMALISATION: tl.constexpr,
-    LAPLACIAN: tl.constexpr, GRADIENT: tl.constexpr, CORRECTED_DIFFUSION: tl.constexpr, MOMENTS: tl.constexpr,
-    SLOPE: tl.constexpr, WEIGHT: tl.constexpr, STRESS: tl.constexpr, INERTIA: tl.constexpr,
-    INVERSE: tl.constexpr, DEVIATION: tl.constexpr, MASS: tl.constexpr, FIELD: tl.constexpr,
-):  # fmt: skip
+    fields,
+    own_stress,
+    out,
+    coefficients,
+    member,
+    start,
+    stop,
+    periods,
+    support,
+    count,
+    D: tl.constexpr,
+    KERNEL: tl.constexpr,
+    RANGES: tl.constexpr,
+    PERIODIC: tl.constexpr,
+    BLOCK: tl.constexpr,
+    JUMPS: tl.constexpr,
+    APPROACH: tl.constexpr,
+    CONTINUITY: tl.constexpr,
+    DIFFUSION: tl.constexpr,
+    CONCENTRATION: tl.constexpr,
+    XSPH: tl.constexpr,
+    PRESSURE: tl.constexpr,
+    ARTIFICIAL: tl.constexpr,
+    LAMINAR: tl.constexpr,
+    TENSILE: tl.constexpr,
+    SHEPARD: tl.constexpr,
+    RENORMALISATION: tl.constexpr,
+    LAPLACIAN: tl.constexpr,
+    GRADIENT: tl.constexpr,
+    CORRECTED_DIFFUSION: tl.constexpr,
+    MOMENTS: tl.constexpr,
+    SLOPE: tl.constexpr,
+    WEIGHT: tl.constexpr,
+    STRESS: tl.constexpr,
+    INERTIA: tl.constexpr,
+    INVERSE: tl.constexpr,
+    DEVIATION: tl.constexpr,
+    MASS: tl.constexpr,
+    FIELD: tl.constexpr,
+):
     """Sums of BLOCK particles; ``fields`` (F, count) and ``out`` (O, count) hold one quantity per row.
 
     WEIGHT ... FIELD are rows of ``fields`` (position first, then velocity); ``coefficients`` has five numbers
@@ -256,9 +299,17 @@ def pair_sums(
             if PRESSURE or ARTIFICIAL:
                 other = load_row(fields, STRESS, count, b, here, 0.0, PRESSURE)
                 push = central_push(
-                    stress, other, value, approach, artificial, pair_inertia * distance,
-                    PRESSURE, ARTIFICIAL, TENSILE, tensile,
-                )  # fmt: skip
+                    stress,
+                    other,
+                    value,
+                    approach,
+                    artificial,
+                    pair_inertia * distance,
+                    PRESSURE,
+                    ARTIFICIAL,
+                    TENSILE,
+                    tensile,
+                )
                 force = vector_sum(force, -push * slope, gap)
             if LAMINAR:
                 other = inverse + tl.load(fields + INVERSE * count + b, mask=here, other=1.0)

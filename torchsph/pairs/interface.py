@@ -106,9 +106,7 @@ class RateTerms:
 
     def __post_init__(self) -> None:
         if self.diffusion and self.corrected_diffusion:
-            raise ValueError(
-                "diffusion and corrected_diffusion are two forms of one term: ask for one of them"
-            )
+            raise ValueError("diffusion and corrected_diffusion are two forms of one term: ask for one of them")
         if self.continuity is not None and self.continuity not in CONTINUITY_FORMS:
             raise ValueError(f"continuity must be one of {CONTINUITY_FORMS} or None, got '{self.continuity}'")
 
@@ -155,9 +153,7 @@ class MomentumTerms:
         if self.pressure is not None and self.pressure not in PRESSURE_FORMS:
             raise ValueError(f"pressure must be one of {PRESSURE_FORMS} or None, got '{self.pressure}'")
         if self.tensile is not None and self.pressure != "symmetric":
-            raise ValueError(
-                f"the tensile term belongs to the symmetric pressure form, got pressure '{self.pressure}'"
-            )
+            raise ValueError(f"the tensile term belongs to the symmetric pressure form, got pressure '{self.pressure}'")
 
 
 @dataclass(frozen=True)
@@ -238,8 +234,19 @@ class Backend(ABC):
         """
 
     def poisson(
-        self, pairs: Any, state: PairState, support: Support, source: Tensor, start: Tensor | None, *,
-        free: Tensor, active: Tensor, singular: Tensor, tolerance: float, iterations: int, group: Tensor | None = None,
+        self,
+        pairs: Any,
+        state: PairState,
+        support: Support,
+        source: Tensor,
+        start: Tensor | None,
+        *,
+        free: Tensor,
+        active: Tensor,
+        singular: Tensor,
+        tolerance: float,
+        iterations: int,
+        group: Tensor | None = None,
     ) -> PoissonSolution:
         """Solve ``laplacian`` u = ``source`` (N,) for each group by itself; a backend may do it in one piece.
 
@@ -251,8 +258,13 @@ class Backend(ABC):
         """
         diagonal = self.laplacian(pairs, state, support, torch.zeros_like(source), active)[1]
         problem = PoissonProblem(
-            lambda u: self.laplacian(pairs, state, support, u, active)[0], diagonal, state.mass, free, singular,
-            state.member if group is None else group, singular.shape[0],
+            lambda u: self.laplacian(pairs, state, support, u, active)[0],
+            diagonal,
+            state.mass,
+            free,
+            singular,
+            state.member if group is None else group,
+            singular.shape[0],
         )
         return solve(problem, source, start, tolerance=tolerance, iterations=iterations)
 

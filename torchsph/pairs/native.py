@@ -255,9 +255,7 @@ def library() -> Library:
         if forced not in PREFERENCE:
             raise LibraryMissing(f"{FORCED}={forced} is unknown; known: {', '.join(PREFERENCE)}")
         if not runs(forced.encode()):
-            raise LibraryMissing(
-                f"{FORCED}={forced} asks for instructions that this processor lacks; unset it"
-            )
+            raise LibraryMissing(f"{FORCED}={forced} asks for instructions that this processor lacks; unset it")
         return _choose((forced,))
     return _choose(tuple(isa for isa in PREFERENCE if runs(isa.encode())))
 

@@ -151,9 +151,7 @@ def _shape_at(support: Support, distance: float) -> Tensor:
     length = torch.as_tensor(support.length, dtype=torch.float64)
     ratio = torch.as_tensor(distance, dtype=torch.float64) / length
     if bool((ratio >= support.kernel.support).any()):
-        raise ValueError(
-            f"tensile_distance {distance:g} lies outside the kernel's support; give the particle spacing"
-        )
+        raise ValueError(f"tensile_distance {distance:g} lies outside the kernel's support; give the particle spacing")
     return support.kernel.shape(ratio)
 
 
@@ -164,9 +162,7 @@ def kernel_choice(support: Support, backend: str) -> tuple[int, list[float]]:
         ValueError: the kernel is not one of ``torchsph.smoothing``.
     """
     if support.per_particle:
-        raise ValueError(
-            f"the {backend} backend has one smoothing length per member; use backend='reference'"
-        )
+        raise ValueError(f"the {backend} backend has one smoothing length per member; use backend='reference'")
     kernel = support.kernel
     family = "gaussian" if kernel.name.startswith("gaussian") else kernel.name
     known = family == "gaussian" or KERNELS.get(kernel.name) is kernel

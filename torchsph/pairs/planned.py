@@ -61,9 +61,7 @@ class PlannedBackend(Backend):
         total, diagonal = self._evaluate(pairs, state, support, request, field, active)
         return total, diagonal
 
-    def _sums(
-        self, pairs: Any, state: PairState, support: Support, requests: list[plan.Pass]
-    ) -> dict[str, Tensor]:
+    def _sums(self, pairs: Any, state: PairState, support: Support, requests: list[plan.Pass]) -> dict[str, Tensor]:
         self._check_state(pairs, state)
         sums: dict[str, Tensor] = {}
         for request in requests:
@@ -81,8 +79,7 @@ class PlannedBackend(Backend):
         self.check(state.position, state.velocity, state.mass, state.deviation)
         if state.position.shape[0] != pairs.count:
             raise ValueError(
-                f"the pairs are of {pairs.count} particles and the state of {state.position.shape[0]}: "
-                "search anew"
+                f"the pairs are of {pairs.count} particles and the state of {state.position.shape[0]}: search anew"
             )
 
     def check(self, *tensors: Tensor) -> None:
@@ -96,8 +93,7 @@ class PlannedBackend(Backend):
                 )
             if tensor.dtype != kind or kind not in (torch.float32, torch.float64):
                 raise TypeError(
-                    f"the {self.name} backend wants all arrays in float32 or all in float64, got {kind}, "
-                    f"{tensor.dtype}"
+                    f"the {self.name} backend wants all arrays in float32 or all in float64, got {kind}, {tensor.dtype}"
                 )
             if tensor.requires_grad:
                 raise ValueError(

@@ -75,9 +75,7 @@ class ReferenceBackend(Backend):
             spread = -2.0 * geometry.factor * rise
             out["diffusion"] = geometry.collect(vb * spread, -va * spread)
         if terms.concentration:
-            out["concentration"] = geometry.collect(
-                vb[:, None] * geometry.gradient, -va[:, None] * geometry.gradient
-            )
+            out["concentration"] = geometry.collect(vb[:, None] * geometry.gradient, -va[:, None] * geometry.gradient)
         if terms.xsph:
             ma, mb = geometry.ends(state.mass)
             da, db = geometry.ends(state.deviation)
@@ -190,9 +188,7 @@ def _central_forces(
 def _linear_part(geometry: _Geometry, state: PairState) -> Tensor:
     """-(slope_a + slope_b) . (x_b - x_a) / 2, what the diffusion of Antuono et al. 2010 leaves alone (P,)."""
     if state.slope is None:
-        raise ValueError(
-            "corrected_diffusion needs the state's slope: the renormalised gradient of the deviation"
-        )
+        raise ValueError("corrected_diffusion needs the state's slope: the renormalised gradient of the deviation")
     slope_a, slope_b = geometry.ends(state.slope)
     return 0.5 * ((slope_a + slope_b) * geometry.gap).sum(1)
 
@@ -253,9 +249,7 @@ class _Geometry:
         return self.support.kernel.value(zero, self._length, self.support.dimension)
 
     def tensile_weight(self, reference: float) -> Tensor:
-        at = self.support.kernel.value(
-            torch.full_like(self.distance, reference), self.length, self.support.dimension
-        )
+        at = self.support.kernel.value(torch.full_like(self.distance, reference), self.length, self.support.dimension)
         return (self.value / at) ** TENSILE_POWER
 
     def ends(self, field: Tensor) -> tuple[Tensor, Tensor]:

@@ -8,9 +8,7 @@ import torch
 from torch import Tensor
 
 
-def half_pairs(
-    position: Tensor, member: Tensor, radius: float, period: Tensor | None = None
-) -> tuple[Tensor, Tensor]:
+def half_pairs(position: Tensor, member: Tensor, radius: float, period: Tensor | None = None) -> tuple[Tensor, Tensor]:
     """All pairs of one member closer than ``radius``; every pair once, sorted by its first particle.
 
     Cells are addressed by sorted keys, not by a dense table, so that a stray particle far away costs nothing
@@ -57,9 +55,7 @@ def _cells(position: Tensor, radius: float, period: Tensor | None) -> tuple[Tens
     return placed_cells(position, radius, period)[:2]
 
 
-def placed_cells(
-    position: Tensor, edge: float, period: Tensor | None
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def placed_cells(position: Tensor, edge: float, period: Tensor | None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Cell index (N, D), number of cells (D,), lower corner of cell 0 (D,), edges (D,); periodic axes hold whole cells.
 
     Cells begin at whole multiples of their edge wherever the particles are, so that which particles share one, and
@@ -96,9 +92,7 @@ def _half_offsets(dimension: int) -> list[tuple[int, ...]]:
     return [o for o in itertools.product((-1, 0, 1), repeat=dimension) if o >= (0,) * dimension]
 
 
-def _shifted(
-    cell: Tensor, offset: tuple[int, ...], cells: Tensor, period: Tensor | None
-) -> tuple[Tensor, Tensor]:
+def _shifted(cell: Tensor, offset: tuple[int, ...], cells: Tensor, period: Tensor | None) -> tuple[Tensor, Tensor]:
     """Neighbouring cell, wrapped on periodic axes, and whether it exists."""
     target = cell + torch.tensor(offset, device=cell.device)
     if period is not None:

@@ -47,9 +47,15 @@ class Backend(Protocol):
         ...
 
     def correlate(
-        self, volume: Tensor, apart: int, corner: Tensor, offset: Tensor, shape: KernelShape,
-        *, ramp: Tensor | None = None,
-    ) -> Tensor:  # fmt: skip
+        self,
+        volume: Tensor,
+        apart: int,
+        corner: Tensor,
+        offset: Tensor,
+        shape: KernelShape,
+        *,
+        ramp: Tensor | None = None,
+    ) -> Tensor:
         """Normalised correlation (P, Lz, Ly, Lx), see :func:`torchsph.ultrasound.correlation.correlate`."""
         ...
 

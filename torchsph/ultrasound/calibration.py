@@ -123,9 +123,7 @@ def _fit_log_variance(table: np.ndarray, square: np.ndarray) -> np.ndarray:
         gradient = design.T @ (1 - ratio) + ridge @ coefficients
         hessian = (design * ratio[:, None]).T @ design + ridge
         step = np.linalg.solve(hessian, gradient)
-        step *= min(
-            1.0, 1.0 / max(np.abs(design @ step).max(), 1e-12)
-        )  # at most a factor e of variance at a time
+        step *= min(1.0, 1.0 / max(np.abs(design @ step).max(), 1e-12))  # at most a factor e of variance at a time
         coefficients -= step
         if np.abs(step).max() < 1e-8:
             result = coefficients / scale
@@ -146,10 +144,7 @@ def _rising_knots(score: np.ndarray, square: np.ndarray) -> tuple[tuple[float, f
             members = last[2] + before[2]
             pools.append(
                 [
-                    *(
-                        (a * last[2] + b * before[2]) / members
-                        for a, b in zip(last[:2], before[:2], strict=True)
-                    ),
+                    *((a * last[2] + b * before[2]) / members for a, b in zip(last[:2], before[:2], strict=True)),
                     members,
                 ]
             )

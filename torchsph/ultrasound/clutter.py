@@ -63,9 +63,7 @@ class FIRFilter:
 
     def apply(self, iq: Tensor) -> Tensor:
         if len(iq) < self.taps:
-            raise ValueError(
-                f"an FIR filter of {self.taps} taps needs as many images, the packet has {len(iq)}"
-            )
+            raise ValueError(f"an FIR filter of {self.taps} taps needs as many images, the packet has {len(iq)}")
         valid, parts = len(iq) - self.taps + 1, torch.view_as_real(iq.resolve_conj()).reshape(len(iq), -1)
         rows = min(valid, IMAGES_AT_ONCE)
         band, design = parts.new_zeros((rows, rows + self.taps - 1)), parts.new_tensor(self.coefficients())

@@ -72,9 +72,16 @@ class CompiledBackend:
         images = images.resolve_conj().contiguous()
         power = images.real.new_empty(images.shape[1:])
         _call(
-            "arrange", power.dtype, images=len(images), shape=tuple(images.shape[1:]), margin=(0, 0, 0),
-            samples=images, volume=None, power=power, turn=None,
-        )  # fmt: skip
+            "arrange",
+            power.dtype,
+            images=len(images),
+            shape=tuple(images.shape[1:]),
+            margin=(0, 0, 0),
+            samples=images,
+            volume=None,
+            power=power,
+            turn=None,
+        )
         return power
 
     def arrange(
@@ -85,9 +92,16 @@ class CompiledBackend:
         volume, power = images.new_empty((*whole, len(images))), images.real.new_empty(whole)
         turn = images.new_empty(whole) if turns else None
         _call(
-            "arrange", power.dtype, images=len(images), shape=shape, margin=margin, samples=images, volume=volume,
-            power=power, turn=turn,
-        )  # fmt: skip
+            "arrange",
+            power.dtype,
+            images=len(images),
+            shape=shape,
+            margin=margin,
+            samples=images,
+            volume=volume,
+            power=power,
+            turn=turn,
+        )
         return volume, power, turn
 
     def box_sums(self, field: Tensor, middle: Tensor, half: tuple[int, int, int]) -> Tensor:
@@ -97,9 +111,15 @@ class CompiledBackend:
         return lambda middle: _box_sums(field, _nodes(middle, field.shape), half)
 
     def correlate(
-        self, volume: Tensor, apart: int, corner: Tensor, offset: Tensor, shape: KernelShape,
-        *, ramp: Tensor | None = None,
-    ) -> Tensor:  # fmt: skip
+        self,
+        volume: Tensor,
+        apart: int,
+        corner: Tensor,
+        offset: Tensor,
+        shape: KernelShape,
+        *,
+        ramp: Tensor | None = None,
+    ) -> Tensor:
         images, half = volume.shape[-1], corner.new_tensor(shape.half)
         check_apart(apart, images)
         reach = tuple(h + s for h, s in zip(shape.half, shape.search, strict=True))
@@ -108,10 +128,20 @@ class CompiledBackend:
         _nodes(corner + half + offset, volume.shape, reach)
         rho = volume.new_empty((len(corner), *shape.lags))
         _call(
-            "correlate", rho.real.dtype, points=len(corner), images=images, apart=apart,
-            shape=tuple(volume.shape[:3]), half=shape.half, search=shape.search, volume=volume.contiguous(),
-            corner=corner, offset=offset, ramp=None if ramp is None else ramp.contiguous(), rho=rho,
-        )  # fmt: skip
+            "correlate",
+            rho.real.dtype,
+            points=len(corner),
+            images=images,
+            apart=apart,
+            shape=tuple(volume.shape[:3]),
+            half=shape.half,
+            search=shape.search,
+            volume=volume.contiguous(),
+            corner=corner,
+            offset=offset,
+            ramp=None if ramp is None else ramp.contiguous(),
+            rho=rho,
+        )
         return rho
 
 
@@ -119,9 +149,16 @@ def _box_sums(field: Tensor, nodes: Tensor, half: tuple[int, int, int]) -> Tenso
     """Sums (P,) over the parts inside the volume of the boxes around ``nodes`` (P, 3)."""
     sums = field.new_empty(len(nodes))
     _call(
-        "box_sums", field.dtype.to_real(), points=len(nodes), parts=1 + field.is_complex(), shape=tuple(field.shape),
-        reach=half, field=field, middle=nodes, out=sums,
-    )  # fmt: skip
+        "box_sums",
+        field.dtype.to_real(),
+        points=len(nodes),
+        parts=1 + field.is_complex(),
+        shape=tuple(field.shape),
+        reach=half,
+        field=field,
+        middle=nodes,
+        out=sums,
+    )
     return sums
 
 

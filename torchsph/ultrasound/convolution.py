@@ -21,9 +21,15 @@ class Convolution:
     """
 
     def __init__(
-        self, origin: tuple[float, ...], sides: tuple[float, ...], pointspread: PointSpread,
-        direction: tuple[float, ...], *, width: int, like: Tensor,
-    ) -> None:  # fmt: skip
+        self,
+        origin: tuple[float, ...],
+        sides: tuple[float, ...],
+        pointspread: PointSpread,
+        direction: tuple[float, ...],
+        *,
+        width: int,
+        like: Tensor,
+    ) -> None:
         nodes = [
             fast_length(max(math.ceil(OVERSAMPLING * band * side / math.pi), 2 * width))
             for band, side in zip(pointspread.band(direction), sides, strict=True)

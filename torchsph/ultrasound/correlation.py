@@ -56,9 +56,10 @@ def gather(volume: Tensor, corner: Tensor, size: tuple[int, int, int], *, early:
     depth, height, width, images = volume.shape
     skipped = 1 if early else 0
     lines = volume.as_strided(
-        (depth * height * width - size[2] + 1 - skipped, size[2] * images), (images, 1),
+        (depth * height * width - size[2] + 1 - skipped, size[2] * images),
+        (images, 1),
         volume.storage_offset() + skipped * images - early,
-    )  # fmt: skip
+    )
     z = corner[:, 0, None, None] + torch.arange(size[0], device=corner.device)[:, None]
     y = corner[:, 1, None, None] + torch.arange(size[1], device=corner.device)
     first = (z * height + y) * width + corner[:, 2, None, None] - skipped
@@ -87,10 +88,12 @@ def correlate(
     starts = range(0, max(len(corner), 1), max(REGION_BYTES // each, 1))
     parts = [slice(start, start + starts.step) for start in starts]
     ramps = [None if ramp is None else ramp[part] for part in parts]
-    return torch.cat([
-        _correlate(volume, apart, corner[part], offset[part], shape, turn)
-        for part, turn in zip(parts, ramps, strict=True)
-    ])  # fmt: skip
+    return torch.cat(
+        [
+            _correlate(volume, apart, corner[part], offset[part], shape, turn)
+            for part, turn in zip(parts, ramps, strict=True)
+        ]
+    )
 
 
 def _correlate(

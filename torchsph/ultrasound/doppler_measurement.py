@@ -46,9 +46,7 @@ class DopplerOptions(ScannerOptions):
         ]
 
 
-def measure_doppler(
-    true: Recording, options: DopplerOptions, seed: int, *, progress: bool = False
-) -> Recording:
+def measure_doppler(true: Recording, options: DopplerOptions, seed: int, *, progress: bool = False) -> Recording:
     """What a scanner's Doppler reports of ``true``: every K-th frame, with ``weight`` (coherence) and
     ``sigma``.
 

@@ -51,9 +51,14 @@ class EchoModel:
 
 
 def simulate_packet(
-    flow: Flow, grid: Grid, model: EchoModel, time: float, generator: torch.Generator,
-    *, dtype: torch.dtype = torch.float32,
-) -> Packet:  # fmt: skip
+    flow: Flow,
+    grid: Grid,
+    model: EchoModel,
+    time: float,
+    generator: torch.Generator,
+    *,
+    dtype: torch.dtype = torch.float32,
+) -> Packet:
     """IQ images of ``flow`` on ``grid``, centred in time on ``time`` (s), of blood power 1.
 
     Scatterers are seeded afresh at the first image and reseeded at every following one where they leave or

@@ -63,9 +63,13 @@ class RecordingFlow:
     """
 
     def __init__(
-        self, recording: Recording, *, margin: float = 4e-3,
-        dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu",
-    ) -> None:  # fmt: skip
+        self,
+        recording: Recording,
+        *,
+        margin: float = 4e-3,
+        dtype: torch.dtype = torch.float32,
+        device: torch.device | str = "cpu",
+    ) -> None:
         self._recording, self._dtype, self._device = recording, dtype, device
         self._pad = max(1, int(np.ceil(margin / min(recording.grid.spacing))))
         self.grid: Grid = recording.grid.padded(self._pad)
@@ -127,9 +131,7 @@ class RecordingFlow:
     def _sample(self, field: Tensor, points: Tensor) -> Tensor:
         """Multilinear interpolation of ``field`` (C, *nodes) at points (n, D) -> (C, n), clamped outside."""
         lower, upper = points.new_tensor(self.grid.origin), points.new_tensor(self.grid.upper)
-        place = (
-            2 * (points - lower) / (upper - lower) - 1
-        )  # the padding leaves at least 3 nodes on every axis
+        place = 2 * (points - lower) / (upper - lower) - 1  # the padding leaves at least 3 nodes on every axis
         place = place.view(1, len(points), *[1] * (points.shape[1] - 1), points.shape[1])
         sampled = F.grid_sample(
             field[None].to(points), place, mode="bilinear", padding_mode="border", align_corners=True

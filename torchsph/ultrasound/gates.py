@@ -13,9 +13,14 @@ from .prepared import Prepared
 
 
 def gates(
-    images: Prepared, nodes: Tensor, *, min_samples: int, min_blood: float | None, min_snr: float | None,
+    images: Prepared,
+    nodes: Tensor,
+    *,
+    min_samples: int,
+    min_blood: float | None,
+    min_snr: float | None,
     max_snr: float | None,
-) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
+) -> tuple[Tensor, Tensor, Tensor]:
     """Power over noise (dB), share of power passed (dB) and the flags that need no correlation, each (P,).
 
     ``nodes`` (P, 3): in the middle of the kernels. See :class:`SpeckleTracker` for the thresholds.

@@ -79,9 +79,7 @@ class Gridding:
             return field.view(self.shape)
         for start in range(0, len(points), CHUNK):
             nodes, weights = self._stencil(points[start : start + CHUNK])
-            field.index_add_(
-                0, nodes.reshape(-1), (weights * values[start : start + CHUNK, None]).reshape(-1)
-            )
+            field.index_add_(0, nodes.reshape(-1), (weights * values[start : start + CHUNK, None]).reshape(-1))
         return field.view(self.shape)
 
     def gather(self, field: Tensor, points: Tensor) -> Tensor:
@@ -100,12 +98,23 @@ class Gridding:
 
     def _call(self, function: ctypes._CFuncPtr, points: Tensor, values: Tensor, field: Tensor) -> None:
         points, triple, dimension = points.contiguous(), _real * 3, len(self.shape)
-        function(ctypes.byref(_Arguments(
-            threads=torch.get_num_threads(), dimension=dimension, width=self.width,
-            shape_parameter=self.shape_parameter, origin=triple(*self.origin), spacing=triple(*self.spacing),
-            counts=(_long * 3)(*reversed(self.shape)), points=len(points), position=points.data_ptr(),
-            values=values.data_ptr(), field=field.data_ptr(),
-        )))  # fmt: skip
+        function(
+            ctypes.byref(
+                _Arguments(
+                    threads=torch.get_num_threads(),
+                    dimension=dimension,
+                    width=self.width,
+                    shape_parameter=self.shape_parameter,
+                    origin=triple(*self.origin),
+                    spacing=triple(*self.spacing),
+                    counts=(_long * 3)(*reversed(self.shape)),
+                    points=len(points),
+                    position=points.data_ptr(),
+                    values=values.data_ptr(),
+                    field=field.data_ptr(),
+                )
+            )
+        )
 
     def wavenumbers(self, axis: int, like: Tensor) -> Tensor:
         """Angular wavenumbers (nodes,), rad/m, of the lattice's Fourier transform; axis 0 is x."""

@@ -52,9 +52,16 @@ class ParallelImager:
     """
 
     def __init__(
-        self, grid: Grid, pointspread: PointSpread, acquisition: Acquisition, beams: Beams,
-        *, width: int = 4, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu",
-    ) -> None:  # fmt: skip
+        self,
+        grid: Grid,
+        pointspread: PointSpread,
+        acquisition: Acquisition,
+        beams: Beams,
+        *,
+        width: int = 4,
+        dtype: torch.dtype = torch.float32,
+        device: torch.device | str = "cpu",
+    ) -> None:
         if beams.apex is not None:
             raise ValueError("ParallelImager needs parallel beams; use SectorImager for beams from an apex")
         self.grid, self.acquisition, self.beams = grid, acquisition, beams
@@ -69,8 +76,11 @@ class ParallelImager:
         self._convolution = Convolution(
             tuple(o - p * s for o, p, s in zip(grid.origin, pad, grid.spacing, strict=True)),
             tuple(n * s for n, s in zip(reversed(self._padded), grid.spacing, strict=True)),
-            pointspread, beams.direction, width=width, like=self._lower,
-        )  # fmt: skip
+            pointspread,
+            beams.direction,
+            width=width,
+            like=self._lower,
+        )
 
     def image(self, points: Tensor, amplitude: Tensor) -> Tensor:
         """IQ (*shape) of scatterers at ``points`` (n, D), m, with complex ``amplitude`` (n,).
@@ -131,7 +141,11 @@ def resize_spectrum(spectrum: Tensor, axis: int, nodes: int) -> Tensor:
     positive, negative = (keep + 1) // 2, (keep - 1) // 2  # an unpaired Nyquist term is dropped
     gap = list(spectrum.shape)
     gap[axis] = nodes - positive - negative
-    return torch.cat([
-        spectrum.narrow(axis, 0, positive), spectrum.new_zeros(gap),
-        spectrum.narrow(axis, have - negative, negative),
-    ], axis)  # fmt: skip
+    return torch.cat(
+        [
+            spectrum.narrow(axis, 0, positive),
+            spectrum.new_zeros(gap),
+            spectrum.narrow(axis, have - negative, negative),
+        ],
+        axis,
+    )

@@ -59,18 +59,14 @@ class ScannerOptions:
         if not (math.isfinite(self.image_spacing) and self.image_spacing > 0):
             raise ValueError(f"image_spacing must be positive and finite, got {self.image_spacing!r}")
         if self.clutter_filter not in FILTERS:
-            raise ValueError(
-                f"clutter_filter must be one of {', '.join(FILTERS)}, got {self.clutter_filter!r}"
-            )
+            raise ValueError(f"clutter_filter must be one of {', '.join(FILTERS)}, got {self.clutter_filter!r}")
         for name in ("beam", "apex"):
             if getattr(self, name) is not None:
                 object.__setattr__(self, name, tuple(float(part) for part in getattr(self, name)))
         self.echo_model(len(self.beam or self.apex or (0,) * 3))  # its parts check the rest
         filtering = self.filter()
         if filtering is not None:
-            filtering.apply(
-                torch.zeros((self.packet, 1), dtype=torch.complex64)
-            )  # a packet too short says so
+            filtering.apply(torch.zeros((self.packet, 1), dtype=torch.complex64))  # a packet too short says so
 
     def filter(self) -> ClutterFilter | None:
         kind = FILTERS[self.clutter_filter]
@@ -92,8 +88,12 @@ class ScannerOptions:
             shape = SectorPointSpread(self.axial_width, self.lateral_width, self.depth)
         return EchoModel(
             Acquisition(self.frequency, self.sound_speed, self.prf, self.packet),
-            shape, Beams(direction, self.apex), self.snr, self.tissue, self.clutter,
-        )  # fmt: skip
+            shape,
+            Beams(direction, self.apex),
+            self.snr,
+            self.tissue,
+            self.clutter,
+        )
 
     def spacing(self, grid: Grid) -> tuple[float, ...]:
         """Image spacing, x, y, z: the nearest that makes the recording's nodes image nodes."""
@@ -162,9 +162,7 @@ class Canvas:
 
     def recording(self, description: str, beams: Beams | None = None) -> Recording:
         """The measurement; with ``beams``, one of the velocity along them alone."""
-        base = self.true.select(self.frames).with_velocity(
-            self.velocity, sigma=self.sigma, description=description
-        )
+        base = self.true.select(self.frames).with_velocity(self.velocity, sigma=self.sigma, description=description)
         if beams is None:
             return replace(base, weight=self.weight)
         along = beams.directions(self.true.grid.nodes()).T.numpy()

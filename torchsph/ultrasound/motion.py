@@ -44,9 +44,17 @@ class Motion:
 
 
 def find_motion(
-    images: Prepared, lag: int, corner: Tensor, offset: Tensor, shape: KernelShape, beam: Tensor,
-    *, ramp: Tensor | None, prior: Motion | None, phase: bool,
-) -> Motion:  # fmt: skip
+    images: Prepared,
+    lag: int,
+    corner: Tensor,
+    offset: Tensor,
+    shape: KernelShape,
+    beam: Tensor,
+    *,
+    ramp: Tensor | None,
+    prior: Motion | None,
+    phase: bool,
+) -> Motion:
     """Motion between images ``lag`` images apart of kernels with first nodes ``corner`` (P, 3), searched
     around ``offset`` (P, 3), nodes.
 
@@ -76,9 +84,15 @@ def find_motion(
 
     magnitude = peak.value.abs()
     return Motion(
-        whole(shift / lag), magnitude, peak.ratio, whole(curvature), whole(variance / (lag**2 * count)),
-        torch.full_like(offset[:, 0], lag), peak.concave & (magnitude > 0), gap,
-    )  # fmt: skip
+        whole(shift / lag),
+        magnitude,
+        peak.ratio,
+        whole(curvature),
+        whole(variance / (lag**2 * count)),
+        torch.full_like(offset[:, 0], lag),
+        peak.concave & (magnitude > 0),
+        gap,
+    )
 
 
 def _axial_shift(peak: Peak, expected: Tensor, phase_per_metre: float) -> Tensor:
@@ -88,9 +102,7 @@ def _axial_shift(peak: Peak, expected: Tensor, phase_per_metre: float) -> Tensor
     return -(angle + 2 * math.pi * turns) / phase_per_metre
 
 
-def _precision(
-    peak: Peak, spacing: Tensor, along: Tensor, phase_per_metre: float | None
-) -> tuple[Tensor, Tensor]:
+def _precision(peak: Peak, spacing: Tensor, along: Tensor, phase_per_metre: float | None) -> tuple[Tensor, Tensor]:
     """Variance of the shift per axis, m^2, up to a constant, and relative curvature, 1/m^2, both (P, D).
 
     The variance of a correlation peak is that of the noise, 1 - rho^2, over its curvature (as in the

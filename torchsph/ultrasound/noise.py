@@ -131,11 +131,7 @@ def measure_frame(
     dimension = velocity.shape[0]
     axial = options.beam_axis % dimension
     growth = noise_growth(velocity, mask, spacing, options)
-    seen = (
-        velocity
-        if options.blur is None
-        else masked_blur(velocity, mask, fwhm_to_deviation(options.blur), spacing)
-    )
+    seen = velocity if options.blur is None else masked_blur(velocity, mask, fwhm_to_deviation(options.blur), spacing)
     noise = smooth_noise(
         dimension + 2,
         mask.shape,
@@ -146,9 +142,7 @@ def measure_frame(
     )
     scatter = torch.randn(mask.shape, generator=generator, dtype=velocity.dtype)
     hop = torch.rand(mask.shape, generator=generator) < options.outliers
-    false_peak = options.search * (
-        2 * torch.rand(velocity.shape, generator=generator, dtype=velocity.dtype) - 1
-    )
+    false_peak = options.search * (2 * torch.rand(velocity.shape, generator=generator, dtype=velocity.dtype) - 1)
 
     passed = _passed_power(seen[axial], options)
     deviation = torch.full((dimension,), options.lateral, dtype=velocity.dtype)
@@ -203,9 +197,7 @@ def _confidence(passed: Tensor, growth: Tensor, patchy: Tensor, scatter: Tensor)
     return (mean + 0.12 * patchy + 0.12 * scatter).clamp(WEIGHT_FLOOR, 1.0)
 
 
-def _as_measurement(
-    true: Recording, frames: list[int], velocity, weight, options: NoiseModel, seed: int
-) -> Recording:
+def _as_measurement(true: Recording, frames: list[int], velocity, weight, options: NoiseModel, seed: int) -> Recording:
     description = (
         f"measurement by a noise model, lateral {options.lateral:g}, axial {options.axial:g} m/s, "
         f"outliers {options.outliers:g}, every {options.every}, seed {seed}"

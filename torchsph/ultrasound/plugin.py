@@ -89,14 +89,16 @@ class LibraryTracker:
         samples = torch.view_as_real(iq.to(torch.complex64).cpu().contiguous()).contiguous()
         dimension = packet.grid.dimension
         position = torch.zeros((len(points), 3), dtype=torch.float64)
-        position[:, :dimension] = points.double().cpu() - torch.tensor(
-            packet.grid.origin, dtype=torch.float64
-        )
+        position[:, :dimension] = points.double().cpu() - torch.tensor(packet.grid.origin, dtype=torch.float64)
         velocity, correlation = torch.full((len(points), 3), torch.nan), torch.zeros(len(points))
         code = self._function()(
-            ctypes.byref(self._parameters(packet, len(iq))), samples.data_ptr(), len(points),
-            position.data_ptr(), velocity.data_ptr(), correlation.data_ptr(),
-        )  # fmt: skip
+            ctypes.byref(self._parameters(packet, len(iq))),
+            samples.data_ptr(),
+            len(points),
+            position.data_ptr(),
+            velocity.data_ptr(),
+            correlation.data_ptr(),
+        )
         if code != 0:
             raise RuntimeError(f"speckle_track of {self.path} failed with code {code}")
         return self._estimates(velocity[:, :dimension], correlation)
@@ -106,10 +108,17 @@ class LibraryTracker:
         missing = 3 - packet.grid.dimension
         triple = ctypes.c_double * 3
         return _Parameters(
-            packet.grid.dimension, images, *shape, triple(*packet.grid.spacing, *[1.0] * missing),
-            packet.acquisition.interval, packet.acquisition.frequency, packet.acquisition.sound_speed,
-            self.kernel, self.search, triple(*packet.beams.direction, *[0.0] * missing),
-        )  # fmt: skip
+            packet.grid.dimension,
+            images,
+            *shape,
+            triple(*packet.grid.spacing, *[1.0] * missing),
+            packet.acquisition.interval,
+            packet.acquisition.frequency,
+            packet.acquisition.sound_speed,
+            self.kernel,
+            self.search,
+            triple(*packet.beams.direction, *[0.0] * missing),
+        )
 
     def _estimates(self, velocity: Tensor, correlation: Tensor) -> Estimates:
         unknown = torch.full_like(correlation, torch.nan)
@@ -119,8 +128,16 @@ class LibraryTracker:
         flags |= (velocity.abs() > self.search).any(1).to(torch.int32) * int(Flag.EDGE)
         clean = torch.where(missing[:, None], 0, velocity)
         return Estimates(
-            velocity=clean, correlation=correlation, peak_ratio=unknown,
-            curvature=torch.full_like(clean, torch.nan), variance=torch.full_like(clean, torch.nan),
-            power=unknown, snr=unknown, response=unknown, shear=unknown, bend=unknown,
-            lag=torch.ones_like(flags), flags=flags,
-        )  # fmt: skip
+            velocity=clean,
+            correlation=correlation,
+            peak_ratio=unknown,
+            curvature=torch.full_like(clean, torch.nan),
+            variance=torch.full_like(clean, torch.nan),
+            power=unknown,
+            snr=unknown,
+            response=unknown,
+            shear=unknown,
+            bend=unknown,
+            lag=torch.ones_like(flags),
+            flags=flags,
+        )

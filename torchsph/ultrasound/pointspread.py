@@ -66,9 +66,7 @@ class GaussianPointSpread:
             for b in range(len(direction))
             if abs(float(covariance[a, b])) > 1e-15 * float(covariance.diagonal().max())
         )
-        return math.sqrt((2 * math.pi) ** len(direction) * float(covariance.det())) * torch.exp(
-            -0.5 * exponent
-        )
+        return math.sqrt((2 * math.pi) ** len(direction) * float(covariance.det())) * torch.exp(-0.5 * exponent)
 
     def energy(self, dimension: int) -> float:
         axial, lateral = fwhm_to_deviation(self.axial), fwhm_to_deviation(self.lateral)

@@ -130,9 +130,16 @@ class Prepared:
 
 
 def prepare(
-    packet: Packet, clutter: ClutterFilter | None, *, kernel: float, min_samples: int, reach: float,
-    least_images: int, follow_shear: bool, backend: Backend,
-) -> Prepared:  # fmt: skip
+    packet: Packet,
+    clutter: ClutterFilter | None,
+    *,
+    kernel: float,
+    min_samples: int,
+    reach: float,
+    least_images: int,
+    follow_shear: bool,
+    backend: Backend,
+) -> Prepared:
     """Filter and pad a packet for kernels of side ``kernel`` and shifts up to ``reach`` between images, m.
 
     Raises ValueError where the filter leaves fewer than ``least_images``.
@@ -170,8 +177,16 @@ def prepare(
         averages = [backend.sums_around(turn, tuple(size * h for h in shape.half)) for size in (1, 2)]
     gain = 1.0 if clutter is None else clutter.noise_gain(len(packet.iq))
     return Prepared(
-        packet, shape, volume, after if clutter is None else padded(before), after, spoilt, margin,
+        packet,
+        shape,
+        volume,
+        after if clutter is None else padded(before),
+        after,
+        spoilt,
+        margin,
         torch.tensor([1.0] * len(lead) + spacing, dtype=after.dtype, device=after.device),
         None if packet.noise is None else packet.noise * gain,
-        *averages, tuple(range(len(lead), 3)), backend,
-    )  # fmt: skip
+        *averages,
+        tuple(range(len(lead), 3)),
+        backend,
+    )

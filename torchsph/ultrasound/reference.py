@@ -45,7 +45,13 @@ class ReferenceBackend:
         return lambda middle: field[middle.unbind(1)]
 
     def correlate(
-        self, volume: Tensor, apart: int, corner: Tensor, offset: Tensor, shape: KernelShape,
-        *, ramp: Tensor | None = None,
-    ) -> Tensor:  # fmt: skip
+        self,
+        volume: Tensor,
+        apart: int,
+        corner: Tensor,
+        offset: Tensor,
+        shape: KernelShape,
+        *,
+        ramp: Tensor | None = None,
+    ) -> Tensor:
         return correlate(volume, apart, corner, offset, shape, ramp=ramp)

@@ -19,12 +19,8 @@ class Box:
     upper: tuple[float, ...]
 
     def __post_init__(self) -> None:
-        if len(self.lower) != len(self.upper) or not all(
-            a < b for a, b in zip(self.lower, self.upper, strict=True)
-        ):
-            raise ValueError(
-                f"a box needs lower < upper on every axis, got {self.lower!r} and {self.upper!r}"
-            )
+        if len(self.lower) != len(self.upper) or not all(a < b for a, b in zip(self.lower, self.upper, strict=True)):
+            raise ValueError(f"a box needs lower < upper on every axis, got {self.lower!r} and {self.upper!r}")
 
     @property
     def sides(self) -> tuple[float, ...]:
@@ -48,9 +44,14 @@ class Cloud:
 
 
 def seed_cloud(
-    box: Box, flow: Flow, time: float, density: float, generator: torch.Generator,
-    *, dtype: torch.dtype = torch.float32,
-) -> Cloud:  # fmt: skip
+    box: Box,
+    flow: Flow,
+    time: float,
+    density: float,
+    generator: torch.Generator,
+    *,
+    dtype: torch.dtype = torch.float32,
+) -> Cloud:
     """Scatterers uniformly at random in ``box``, ``density`` per m^D, of power 1 and random phase."""
     if not density > 0:
         raise ValueError(f"scatterer density must be positive (per m^D), got {density!r}")
@@ -90,9 +91,15 @@ def carry(
 
 
 def reseed(
-    cloud: Cloud, box: Box, flow: Flow, time: float, density: float, generator: torch.Generator,
-    *, per_cell: float = 100.0,
-) -> Cloud:  # fmt: skip
+    cloud: Cloud,
+    box: Box,
+    flow: Flow,
+    time: float,
+    density: float,
+    generator: torch.Generator,
+    *,
+    per_cell: float = 100.0,
+) -> Cloud:
     """Even out a density that a flow has changed (per m^D): new scatterers in thin cells, fewer in crowded
     ones.
 
@@ -143,9 +150,7 @@ def _cell_number(position: Tensor, box: Box, cells: list[int]) -> Tensor:
     share = (position - position.new_tensor(box.lower)) / position.new_tensor(box.sides)
     number = torch.zeros(len(position), dtype=torch.long, device=position.device)
     for axis in reversed(range(len(cells))):
-        number = number * cells[axis] + (share[:, axis] * cells[axis]).floor().long().clamp(
-            0, cells[axis] - 1
-        )
+        number = number * cells[axis] + (share[:, axis] * cells[axis]).floor().long().clamp(0, cells[axis] - 1)
     return number
 
 

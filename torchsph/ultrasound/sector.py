@@ -26,9 +26,16 @@ class SectorImager:
     """
 
     def __init__(
-        self, grid: Grid, pointspread: SectorPointSpread, acquisition: Acquisition, beams: Beams,
-        *, width: int = 4, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu",
-    ) -> None:  # fmt: skip
+        self,
+        grid: Grid,
+        pointspread: SectorPointSpread,
+        acquisition: Acquisition,
+        beams: Beams,
+        *,
+        width: int = 4,
+        dtype: torch.dtype = torch.float32,
+        device: torch.device | str = "cpu",
+    ) -> None:
         if beams.apex is None:
             raise ValueError("SectorImager needs beams from an apex; use ParallelImager for parallel beams")
         self.grid, self.acquisition, self.beams = grid, acquisition, beams

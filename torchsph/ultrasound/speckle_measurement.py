@@ -34,17 +34,13 @@ class SpeckleOptions(ScannerOptions):
     def tracker(self) -> SpeckleTracker:
         # a scanner's operator knows about how bright blood is; speckle alone hardly takes a kernel 6 dB above that
         max_snr = self.snr + BRIGHTEST
-        return SpeckleTracker(
-            kernel=self.kernel, search=self.search, clutter=self.filter(), max_snr=max_snr
-        )
+        return SpeckleTracker(kernel=self.kernel, search=self.search, clutter=self.filter(), max_snr=max_snr)
 
     def plan(self) -> TrainingPlan:
         return TrainingPlan(simulations=self.training)
 
 
-def measure_speckle(
-    true: Recording, options: SpeckleOptions, seed: int, *, progress: bool = False
-) -> Recording:
+def measure_speckle(true: Recording, options: SpeckleOptions, seed: int, *, progress: bool = False) -> Recording:
     """What a scanner and a speckle tracker report of ``true``: every K-th frame, with ``weight`` and
     ``sigma``.
 
@@ -65,9 +61,7 @@ def measure_speckle(
         if packets:
             found = tracker.track(packets[0], points)
             beam = model.beams.directions(points).to(found.velocity)
-            canvas.paint(
-                frame, found.velocity, calibration.sigma(found, beam), calibration.weight(found, beam)
-            )
+            canvas.paint(frame, found.velocity, calibration.sigma(found, beam), calibration.weight(found, beam))
             accepted, total = accepted + int(found.accepted.sum()), total + len(points)
     share = accepted / total if total else 0.0
     return canvas.recording(

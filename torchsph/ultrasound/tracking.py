@@ -90,11 +90,15 @@ class SpeckleTracker:
 def track(packet: Packet, points: Tensor, options: SpeckleTracker) -> Estimates:
     """Track ``points`` (n, D) through a packet. ValueError where no two images are left to compare."""
     images = prepare(
-        packet, options.clutter, kernel=options.kernel, min_samples=options.min_samples,
+        packet,
+        options.clutter,
+        kernel=options.kernel,
+        min_samples=options.min_samples,
         reach=options.search * packet.acquisition.interval * options.lags[0],
-        least_images=1 + options.lags[0], follow_shear=options.follow_shear,
+        least_images=1 + options.lags[0],
+        follow_shear=options.follow_shear,
         backend=backend(options.backend, packet.iq.device),
-    )  # fmt: skip
+    )
     nodes, beam = images.nearest_nodes(points), images.directions(points)
     starts = range(0, max(len(points), 1), options.tile)
     tiles = [slice(start, start + options.tile) for start in starts]
@@ -104,10 +108,13 @@ def track(packet: Packet, points: Tensor, options: SpeckleTracker) -> Estimates:
 def _track_tile(images: Prepared, nodes: Tensor, beam: Tensor, options: SpeckleTracker) -> Estimates:
     """Estimates at a tile of nodes (P, 3); only those that pass the gates are correlated."""
     snr, share, flags = gates(
-        images, nodes,
-        min_samples=options.min_samples, min_blood=options.min_blood, min_snr=options.min_snr,
+        images,
+        nodes,
+        min_samples=options.min_samples,
+        min_blood=options.min_blood,
+        min_snr=options.min_snr,
         max_snr=options.max_snr,
-    )  # fmt: skip
+    )
     axes = list(reversed(images.active))
     packet, interval = images.packet, images.packet.acquisition.interval
     kept = torch.nonzero(flags == 0)[:, 0]
@@ -123,32 +130,42 @@ def _track_tile(images: Prepared, nodes: Tensor, beam: Tensor, options: SpeckleT
         return values.new_full((len(nodes), *values.shape[1:]), otherwise).index_copy(0, kept, values)
 
     return Estimates(
-        velocity=spread(velocity, 0.0), correlation=spread(motion.correlation, 0.0),
-        peak_ratio=spread(motion.peak_ratio, 1.0), curvature=spread(motion.curvature[:, axes], 0.0),
+        velocity=spread(velocity, 0.0),
+        correlation=spread(motion.correlation, 0.0),
+        peak_ratio=spread(motion.peak_ratio, 1.0),
+        curvature=spread(motion.curvature[:, axes], 0.0),
         # of what was not correlated nothing is known but that it is within the range
         variance=spread(motion.variance[:, axes] / interval**2, options.search**2),
-        power=share, snr=snr, response=spread(response, 0.0), shear=images.shear(ramp, len(nodes)),
-        bend=images.bend(nodes), lag=spread(motion.lag, options.lags[0]), flags=flags,
-    )  # fmt: skip
+        power=share,
+        snr=snr,
+        response=spread(response, 0.0),
+        shear=images.shear(ramp, len(nodes)),
+        bend=images.bend(nodes),
+        lag=spread(motion.lag, options.lags[0]),
+        flags=flags,
+    )
 
 
-def _follow(
-    images: Prepared, nodes: Tensor, beam: Tensor, ramp: Tensor | None, options: SpeckleTracker
-) -> Motion:
+def _follow(images: Prepared, nodes: Tensor, beam: Tensor, ramp: Tensor | None, options: SpeckleTracker) -> Motion:
     """The first lag searched over the whole range, each further one around what is known by then."""
     corner, wide = images.corner(nodes), images.shape
     motion = find_motion(
-        images, options.lags[0], corner, torch.zeros_like(nodes), wide, beam,
-        ramp=ramp, prior=None, phase=options.phase,
-    )  # fmt: skip
+        images,
+        options.lags[0],
+        corner,
+        torch.zeros_like(nodes),
+        wide,
+        beam,
+        ramp=ramp,
+        prior=None,
+        phase=options.phase,
+    )
     narrow = KernelShape(wide.half, tuple(min(s, 1) for s in wide.search))
     for lag in (lag for lag in options.lags[1:] if lag < images.volume.shape[-1]):
         offset = (motion.shift * lag / images.spacing).round().long()
         fits = images.holds(nodes + offset)
         offset = torch.where(fits[:, None], offset, 0)
-        found = find_motion(
-            images, lag, corner, offset, narrow, beam, ramp=ramp, prior=motion, phase=options.phase
-        )
+        found = find_motion(images, lag, corner, offset, narrow, beam, ramp=ramp, prior=motion, phase=options.phase)
         motion = motion.better(found, fits)
     return motion
 
@@ -178,9 +195,7 @@ def _sheared(motion: Motion, gradient: Tensor) -> Tensor:
     return torch.exp(-exponent.sum(1))
 
 
-def _doubts(
-    velocity: Tensor, motion: Motion, coherent: Tensor, response: Tensor, options: SpeckleTracker
-) -> Tensor:
+def _doubts(velocity: Tensor, motion: Motion, coherent: Tensor, response: Tensor, options: SpeckleTracker) -> Tensor:
     """Flags (P,) of correlated points; velocity (P, D) m/s, correlation to be expected (P,), response (P,), dB."""
     flags = bit(~motion.sound, Flag.FLAT)
     # a fit that overshoots by 2 % of the range is still the range's own edge
@@ -189,8 +204,6 @@ def _doubts(
         flags |= bit(response < options.min_response, Flag.STOPPED)
     flags |= bit(motion.gap > TOLERATED_GAP, Flag.AMBIGUOUS)
     alone = (motion.lag == options.lags[0]) & (len(options.lags) > 1)
-    least = torch.where(
-        alone, max(options.lone_correlation, options.min_correlation), options.min_correlation
-    )
+    least = torch.where(alone, max(options.lone_correlation, options.min_correlation), options.min_correlation)
     floor = min(LEAST_CORRELATION, options.min_correlation)
     return flags | bit(motion.correlation < (least * coherent).clamp_min(floor), Flag.DECORRELATED)

@@ -51,9 +51,15 @@ class SwirlFlow:
 
 
 def random_swirl(
-    centre: tuple[float, ...], radius: float, speed: float, generator: torch.Generator,
-    *, waves: int = 6, tissue_speed: float = 0.0, finest: float = FINEST,
-) -> SwirlFlow:  # fmt: skip
+    centre: tuple[float, ...],
+    radius: float,
+    speed: float,
+    generator: torch.Generator,
+    *,
+    waves: int = 6,
+    tissue_speed: float = 0.0,
+    finest: float = FINEST,
+) -> SwirlFlow:
     """A swirl of RMS ``speed``, m/s, with wavelengths of ``finest`` to ``COARSEST`` diameters of the ball.
 
     They are spread evenly on a logarithmic scale: vortices as large as a ventricle, shear layers that a kernel
@@ -98,11 +104,7 @@ class TrainingPlan:
     tissue_speed: float = 0.02
 
     def __post_init__(self) -> None:
-        if (
-            isinstance(self.simulations, bool)
-            or not isinstance(self.simulations, int)
-            or self.simulations < 2
-        ):
+        if isinstance(self.simulations, bool) or not isinstance(self.simulations, int) or self.simulations < 2:
             raise ValueError(f"simulations must be a whole number >= 2, got {self.simulations!r}")
         for name in ("half", "step", "slowest", "fastest"):
             if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0):
@@ -111,7 +113,7 @@ class TrainingPlan:
 
 def random_scene(
     centre: tuple[float, ...], half: float, speed: float, generator: torch.Generator, *, tissue_speed: float = 0.0
-) -> SwirlFlow:  # fmt: skip
+) -> SwirlFlow:
     """Blood beside a wall of tissue, in view of a cube (square) of ``half`` its side around ``centre``, m.
 
     How far the wall is from the centre, where it lies and how it is bent are random, and so is how smooth the
@@ -138,9 +140,14 @@ def training_points(plan: TrainingPlan, centre: tuple[float, ...]) -> Tensor:
 
 
 def calibrate(
-    model: EchoModel, tracker: Tracker, spacing: tuple[float, ...], generator: torch.Generator,
-    plan: TrainingPlan = TrainingPlan(), *, centre: tuple[float, ...] | None = None,
-) -> Calibration:  # fmt: skip
+    model: EchoModel,
+    tracker: Tracker,
+    spacing: tuple[float, ...],
+    generator: torch.Generator,
+    plan: TrainingPlan = TrainingPlan(),
+    *,
+    centre: tuple[float, ...] | None = None,
+) -> Calibration:
     """Fit deviations and weights of ``tracker`` on random scenes; image ``spacing`` x, y, z, m.
 
     centre: of the scenes, m, where beams from an apex make the place matter; ``None`` = the origin.

@@ -37,13 +37,9 @@ class UffVolumes:
         if not np.iscomplexobj(self.values) or self.values.shape[1] != 1:
             raise ValueError("these UFF volumes are no IQ: they must be complex with one channel")
         if self.frame_rate is None or self.modulation_frequency is None:
-            raise ValueError(
-                "the UFF file states no frame_rate or no modulation_frequency; set them in UffVolumes"
-            )
+            raise ValueError("the UFF file states no frame_rate or no modulation_frequency; set them in UffVolumes")
         acquisition = Acquisition(self.modulation_frequency, sound_speed, self.frame_rate, len(self.values))
-        return Packet(
-            torch.from_numpy(np.ascontiguousarray(self.values[:, 0])), self.grid, acquisition, beams, noise
-        )
+        return Packet(torch.from_numpy(np.ascontiguousarray(self.values[:, 0])), self.grid, acquisition, beams, noise)
 
 
 def read_uff(path: str | Path, name: str = "beamformed_data") -> UffVolumes:
@@ -124,9 +120,7 @@ def _pyuff() -> ModuleType:
     try:
         import pyuff_ustb
     except ImportError as error:
-        raise ImportError(
-            "UFF files need the optional package pyuff_ustb: pip install torchsph[uff]"
-        ) from error
+        raise ImportError("UFF files need the optional package pyuff_ustb: pip install torchsph[uff]") from error
     return pyuff_ustb
 
 
