@@ -33,7 +33,10 @@ ROOT = Path(__file__).resolve().parents[1]
 # what a source distribution carries beside the packages; kept here because the top level is for the packages
 manifest_maker.template = ".build/MANIFEST.in"
 # the script whose build(folder) compiles, and the package folder that the libraries go to
-NATIVE = (("torchsph/pairs/build.py", "torchsph/_native"), ("regularize/native_build.py", "regularize"))
+NATIVE = (
+    ("torchsph/native/build.py", "torchsph/native/libraries"),
+    ("regularize/native/build.py", "regularize/native"),
+)
 
 
 def build_wheel(

@@ -24,7 +24,8 @@ import numpy as np
 from matplotlib import pyplot
 
 from torchsph import Simulator, WeaklyCompressible
-from torchsph.dam_breaks import (
+from torchsph.simulator.simulation import Simulation
+from torchsph.validation.dam_breaks import (
     GRAVITY,
     IMPACT_OPTIONS,
     OBSTACLE,
@@ -34,7 +35,6 @@ from torchsph.dam_breaks import (
     obstacle_run,
     obstacle_scene,
 )
-from torchsph.simulation import Simulation
 
 SECTION_TIMES = (0.45, 0.8)  # s
 DEPTH = OBSTACLE_COLUMN[1][2]

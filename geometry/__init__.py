@@ -1,24 +1,24 @@
 """Recordings, regular grids, closed surfaces and their signed distance, moving walls, ventricle shapes."""
 
-from .closest import Closest, SurfaceIndex
-from .distance import GridDistance, distance_and_closest, signed_distance
-from .grid import Grid, Stencil
-from .motion import WallMotion
-from .moving_distance import MovingDistance, WallField, WallPoint
-from .orifices import Orifice, OrificePlane, orifices
-from .recording import Recording, Wall
-from .recording_read import read_recording
-from .recording_rules import RecordingError
-from .recording_write import write_recording
-from .refine import refined, refined_motion
-from .repair import repaired
-from .segmentation import surface_from_mask, surface_from_points, surface_from_velocity, taubin
-from .shapes import box, ellipse, ellipsoid, polygon, revolved, tube
-from .surface import Surface, SurfaceError
-from .surface_files import labelled, read_surface, write_surface
-from .ventricle import Beat, Ventricle
-from .wall_points import WallPoints, WallSampler, wall_points
-from .winding import grid_winding, winding_number
+from .grids.grid import Grid, Stencil
+from .motion.moving_distance import MovingDistance, WallField, WallPoint
+from .motion.orifices import Orifice, OrificePlane, orifices
+from .motion.refine import refined, refined_motion
+from .motion.wall_motion import WallMotion
+from .motion.wall_points import WallPoints, WallSampler, wall_points
+from .recordings.read import read_recording
+from .recordings.recording import Recording, Wall
+from .recordings.rules import RecordingError
+from .recordings.write import write_recording
+from .surfaces.closest import Closest, SurfaceIndex
+from .surfaces.distance import GridDistance, distance_and_closest, signed_distance
+from .surfaces.files import labelled, read_surface, write_surface
+from .surfaces.repair import repaired
+from .surfaces.segmentation import surface_from_mask, surface_from_points, surface_from_velocity, taubin
+from .surfaces.shapes import box, ellipse, ellipsoid, polygon, revolved, tube
+from .surfaces.surface import Surface, SurfaceError
+from .surfaces.winding import grid_winding, winding_number
+from .ventricle.ventricle import Beat, Ventricle
 
 __all__ = [
     "Beat",

@@ -3,22 +3,22 @@
 Knows numpy, scipy and torch only; walls come in as arrays (:class:`WallRows`).
 """
 
-from .block import BlockFactor
-from .bspline import basis
-from .direct import Factor, PreparedSystem, solve_direct
+from .basis.bspline import basis
+from .basis.knots import Knots
 from .errors import InvalidInput, NotConverged
-from .field import SplineField
-from .knots import Knots
-from .krylov import Solution, lsqr
-from .likelihood import Choice
-from .lsmr import lsmr
-from .operators import CellRows, DirectionRows, DivergenceRows, System, VectorRows
-from .pcg import pcg
-from .posterior import Posterior
-from .sequence import WindowedField, blur_in_time, fit_windows
-from .smoother import Smoother
-from .sparse import sparse_matrix, sparse_operators
-from .walls import WallRows
+from .rows.operators import CellRows, DirectionRows, DivergenceRows, System, VectorRows
+from .rows.sparse import sparse_matrix, sparse_operators
+from .rows.walls import WallRows
+from .smoothing.field import SplineField
+from .smoothing.sequence import WindowedField, blur_in_time, fit_windows
+from .smoothing.smoother import Smoother
+from .solvers.block import BlockFactor
+from .solvers.direct import Factor, PreparedSystem, solve_direct
+from .solvers.krylov import Solution, lsqr
+from .solvers.lsmr import lsmr
+from .solvers.pcg import pcg
+from .statistics.likelihood import Choice
+from .statistics.posterior import Posterior
 
 __all__ = [
     "BlockFactor",

@@ -5,17 +5,19 @@ and an ensemble filter joins forecasts and measurements.
 """
 
 from ._version import __version__
-from .ensemble import EnsembleRun, assimilate, default_filter
-from .ensemble_options import EnsembleOptions, Estimated
-from .forecast import ForecastSkill, GridForecast, Transfer, skill
-from .incompressible import Projection
-from .observation_error import ObservationError, estimate_error
-from .particle_filter import FilteredRun, filter_sph
-from .pipeline import DEFAULT_METHOD, METHODS, MethodResult, forecast_skill, make_model, run_methods
-from .population import PopulationControl
-from .presets import PRESETS, preset
-from .scene import Fluid, Scene, Valve
-from .schemes import (
+from .methods.by_name import DEFAULT_METHOD, METHODS, MethodResult, forecast_skill, make_model, run_methods
+from .methods.ensemble.assimilate import EnsembleRun, assimilate, default_filter
+from .methods.ensemble.options import EnsembleOptions, Estimated
+from .methods.frame_splines import smooth
+from .methods.measurement.error_model import ObservationError, estimate_error
+from .methods.nudging import FilteredRun, filter_sph
+from .pairs.smoothing_kernels import KERNELS, SmoothingKernel, kernel
+from .simulator.grid_forecast import ForecastSkill, GridForecast, Transfer, skill
+from .simulator.population import PopulationControl
+from .simulator.scene import Fluid, Scene, Valve
+from .simulator.schemes.presets import PRESETS, preset
+from .simulator.schemes.projection import Projection
+from .simulator.schemes.weakly_compressible import (
     XSPH,
     CompleteKernelWall,
     GammaRamp,
@@ -25,11 +27,9 @@ from .schemes import (
     Rollback,
     WeaklyCompressible,
 )
-from .seeding import ResidualMotion, Seeding, residual_motion
-from .simulation import NumericalFailure, Simulation
-from .simulator import Simulator
-from .smooth import smooth
-from .smoothing import KERNELS, SmoothingKernel, kernel
+from .simulator.seeding import ResidualMotion, Seeding, residual_motion
+from .simulator.simulation import NumericalFailure, Simulation
+from .simulator.simulator import Simulator
 
 __all__ = [
     "DEFAULT_METHOD",

@@ -2,7 +2,7 @@
 
 import sys
 
-from torchsph.cli import main
+from torchsph.cli.main import main
 
 if __name__ == "__main__":
     sys.exit(main())

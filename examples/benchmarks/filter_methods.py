@@ -24,8 +24,8 @@ import torch
 from filter_sweeps import around_the_fastest, averaged
 
 import geometry
-from torchsph.metrics import METRICS, evaluate, filled_velocity, spread_over_skill
-from torchsph.pipeline import run_methods
+from torchsph.evaluation.metrics import METRICS, evaluate, filled_velocity, spread_over_skill
+from torchsph.methods.by_name import run_methods
 
 
 def table(measured: geometry.Recording, truth: geometry.Recording, lag: int | None, seed: int) -> dict[str, dict]:

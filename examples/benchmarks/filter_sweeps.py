@@ -30,9 +30,9 @@ import torch
 import geometry
 import regularize
 from torchsph import assimilate, make_model
-from torchsph.free_run import run_freely
-from torchsph.metrics import evaluate, spread_over_skill
-from torchsph.smooth import FrameSmoother, smooth_frames
+from torchsph.evaluation.metrics import evaluate, spread_over_skill
+from torchsph.methods.frame_splines import FrameSmoother, smooth_frames
+from torchsph.methods.free_run import run_freely
 from torchsph.ultrasound import NoiseModel, measure_noise
 
 MEMBERS = 16

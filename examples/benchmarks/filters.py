@@ -11,7 +11,7 @@ import argparse
 import sys
 import time
 
-from torchsph.assimilation.benchmarks import benchmarks
+from torchsph.assimilation.twins.benchmarks import benchmarks
 
 
 def main(arguments: list[str] | None = None) -> int:

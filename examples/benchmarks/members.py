@@ -32,7 +32,7 @@ import torch
 import geometry
 from torchsph import Scene, Simulator, preset
 from torchsph.data import sample_measurement
-from torchsph.forecast import GridForecast, Transfer
+from torchsph.simulator.grid_forecast import GridForecast, Transfer
 
 
 def forecasts(measured: geometry.Recording, model: Simulator, members: int, clock: Callable[[], float]) -> float:

@@ -27,10 +27,10 @@ from dataclasses import asdict, dataclass
 import torch
 
 from torchsph import Fluid, Scene, Simulator, WeaklyCompressible
+from torchsph.native.library import library
 from torchsph.pairs import Backend, MomentumTerms, PairState, RateTerms, Support, available_backends, backend
 from torchsph.pairs.interface import square_length
-from torchsph.pairs.native import library
-from torchsph.smoothing import kernel
+from torchsph.pairs.smoothing_kernels import kernel
 
 LENGTH = 1.2
 SUPPORT = Support(kernel("wendland_c2"), LENGTH, 3)

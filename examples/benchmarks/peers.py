@@ -37,9 +37,16 @@ import numpy as np
 import torch
 
 from torchsph import Simulator, WeaklyCompressible
-from torchsph.dam_breaks import GRAVITY, KOSHIZUKA_OKA_1996, MARTIN_MOYCE_1952, column_scene, front_error, surge_front
-from torchsph.free_surface import resting_block
-from torchsph.validation import FREE_SURFACE_OPTIONS
+from torchsph.validation.dam_breaks import (
+    GRAVITY,
+    KOSHIZUKA_OKA_1996,
+    MARTIN_MOYCE_1952,
+    column_scene,
+    front_error,
+    surge_front,
+)
+from torchsph.validation.exact_flows import FREE_SURFACE_OPTIONS
+from torchsph.validation.free_surface import resting_block
 
 # t sqrt(2 g / a) of the last measured point before the far wall; when the front hits it, PySPH's example becomes
 # unstable at 0.02 m (and later ends in a segmentation fault)

@@ -27,8 +27,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 import torch
 
-from torchsph import Seeding, validation
-from torchsph.validation_runs import taylor_green, taylor_green_error
+from torchsph import Seeding
+from torchsph.validation import exact_flows as validation
+from torchsph.validation.runs import taylor_green, taylor_green_error
 
 DECAY_TIME = 100 / (8 * math.pi**2)
 SCHEMES = {"EDAC": ["--scheme", "edac"], "delta-SPH": ["--scheme", "wcsph", "--delta-sph"]}

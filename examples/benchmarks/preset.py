@@ -87,8 +87,8 @@ from torchsph import (
     skill,
 )
 from torchsph.data import sample_truth
-from torchsph.presets import Scheme
-from torchsph.validation_runs import taylor_green, taylor_green_error
+from torchsph.simulator.schemes.presets import Scheme
+from torchsph.validation.runs import taylor_green, taylor_green_error
 
 LEADS = (0.01, 0.04)  # s
 DECAY_TIME = 100 / (8 * math.pi**2)

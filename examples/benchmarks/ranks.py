@@ -28,8 +28,9 @@ import torch
 import torch.distributed as dist
 
 import geometry
-from torchsph import parallel, pipeline
 from torchsph.data import sample_measurement
+from torchsph.methods import by_name as pipeline
+from torchsph.methods.runtime import parallel
 
 EXCHANGES = ("all_gather", "all_gather_object", "broadcast", "broadcast_object_list", "barrier")
 

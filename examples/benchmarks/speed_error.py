@@ -51,21 +51,12 @@ import torch
 from walls import steady_pipe
 
 import geometry
-from torchsph import (
-    GammaRamp,
-    PotentialWall,
-    Projection,
-    Scene,
-    Simulator,
-    WeaklyCompressible,
-    preset,
-    skill,
-    validation,
-)
+from torchsph import GammaRamp, PotentialWall, Projection, Scene, Simulator, WeaklyCompressible, preset, skill
 from torchsph.data import sample_truth
-from torchsph.presets import Scheme
-from torchsph.validation_ellipsoid import PulsatingEllipsoid
-from torchsph.validation_runs import channel, channel_error, kinetic_energy, taylor_green, taylor_green_error
+from torchsph.simulator.schemes.presets import Scheme
+from torchsph.validation import exact_flows as validation
+from torchsph.validation.ellipsoid import PulsatingEllipsoid
+from torchsph.validation.runs import channel, channel_error, kinetic_energy, taylor_green, taylor_green_error
 
 SAMPLE = sample_truth()
 DECAY_TIME = 100 / (8 * math.pi**2)

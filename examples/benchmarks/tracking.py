@@ -32,7 +32,7 @@ from torchsph.ultrasound import (
     random_scene,
     simulate_packet,
 )
-from torchsph.ultrasound.training import training_points
+from torchsph.ultrasound.measurements.training import training_points
 
 STEP = 1e-3 / 6
 CENTRE = (0.0, 0.0, 24e-3)

@@ -27,7 +27,8 @@ from scipy.ndimage import binary_erosion
 from tracking import terciles
 
 import geometry
-from torchsph import metrics, pipeline, slices
+from torchsph.evaluation import metrics, slices
+from torchsph.methods import by_name as pipeline
 from torchsph.ultrasound import SpeckleOptions, measure_speckle
 
 COLUMNS = 9

@@ -28,8 +28,8 @@ from tracking import CENTRE, STEP, image_grid, lattice
 
 from geometry import Grid
 from torchsph.ultrasound import EchoModel, LinearFlow, Packet, SpeckleTracker, simulate_packet
-from torchsph.ultrasound.backends import backend
-from torchsph.ultrasound.correlation import KernelShape
+from torchsph.ultrasound.estimation.backends import backend
+from torchsph.ultrasound.estimation.correlation import KernelShape
 
 PHANTOM = (20e-3, 20e-3, 33e-3)  # x, y, z, m
 

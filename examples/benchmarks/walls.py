@@ -46,21 +46,15 @@ import torch
 from scipy.spatial.transform import Rotation
 
 import geometry
-from torchsph import (
-    CompleteKernelWall,
-    PotentialWall,
-    Scene,
-    Simulator,
-    WeaklyCompressible,
-    validation_walls,
-    wall_closest,
-)
-from torchsph.presets import Scheme
-from torchsph.scene import Fluid
-from torchsph.simulation import Simulation
-from torchsph.smoothing import kernel
-from torchsph.validation_ellipsoid import PulsatingEllipsoid
-from torchsph.wallfield import WallFields
+from torchsph import CompleteKernelWall, PotentialWall, Scene, Simulator, WeaklyCompressible
+from torchsph.pairs.smoothing_kernels import kernel
+from torchsph.simulator.scene import Fluid
+from torchsph.simulator.schemes.presets import Scheme
+from torchsph.simulator.simulation import Simulation
+from torchsph.simulator.walls import closest as wall_closest
+from torchsph.simulator.walls.fields import WallFields
+from torchsph.validation import exact_wall_flows as validation_walls
+from torchsph.validation.ellipsoid import PulsatingEllipsoid
 
 WALLS = {
     "complete kernel": CompleteKernelWall(),
@@ -176,7 +170,7 @@ def fields(repeats: int) -> dict[str, float]:
         made = WallFields(motion, 1e-3, 1.0, kernel("wendland_c2"), 1.3, True, "cpu", torch.float32)
         made.key(0, ())
         moments = range(1, len(made.moments.times))
-        with mock.patch("torchsph.wallfield.closest_on_grid", closest):
+        with mock.patch("torchsph.simulator.walls.fields.closest_on_grid", closest):
             began = time.process_time()
             for moment in moments:
                 made.key(moment, ())

@@ -16,9 +16,9 @@ component-major field of vectors gives the position of each node once; random nu
 `torch.Generator`; the algebra of the ensemble is float64 whatever the precision of the state.
 """
 
-from .augmented import Augmentation, Parameter
-from .correlated import gaussian_correlation, redundancy, thin
-from .diagnostics import (
+from .diagnostics.figure import filter_figure
+from .diagnostics.record import FilterRecord
+from .diagnostics.scores import (
     InnovationStatistics,
     chi2_band,
     crps,
@@ -29,27 +29,27 @@ from .diagnostics import (
     spread_skill,
 )
 from .distributed import Distributed, gather_members, member_slice
-from .enkf import StochasticEnKF
-from .error_scale import ErrorScale
+from .error_correlation import gaussian_correlation, redundancy, thin
 from .errors import AssimilationError
-from .etkf import ETKF
-from .failures import Repaired, Replacement, replace_failed
-from .figure import filter_figure
-from .filters import Analysis, EnsembleFilter, Filter, GlobalTransform, Transform, check_ensemble
-from .hybrid import HybridGain
-from .inflation import RTPP, RTPS, Adaptive, Inflation, Multiplicative
-from .learned_gain import LearnedGain
-from .letkf import LETKF, LocalTransform
-from .localisation import Localisation, gaspari_cohn
+from .filters.base import Analysis, EnsembleFilter, Filter, GlobalTransform, Transform, check_ensemble
+from .filters.enkf import StochasticEnKF
+from .filters.etkf import ETKF
+from .filters.fixed_lag import FixedLagSmoother
+from .filters.hybrid import HybridGain
+from .filters.inflation import RTPP, RTPS, Adaptive, Inflation, Multiplicative
+from .filters.letkf import LETKF, LocalTransform
+from .filters.localisation import Localisation, gaspari_cohn
+from .filters.reduced_unscented import ReducedUnscented
+from .filters.rotation import random_rotation
+from .filters.sigma import SigmaPoints, Simplex, Symmetric, draw_ensemble, draw_points
+from .filters.subspace import ErrorSubspace, update_weights, zero_sum_basis
+from .filters.unscented import UnscentedFilter, UnscentedUpdate
 from .observations import Observations, Reason, Screened, concatenate, count_reasons, screen
-from .record import FilterRecord
-from .reduced_unscented import ReducedUnscented
-from .rotation import random_rotation
-from .sigma import SigmaPoints, Simplex, Symmetric, draw_ensemble, draw_points
-from .smoother import FixedLagSmoother
-from .spread_match import SpreadMatch
-from .subspace import ErrorSubspace, update_weights, zero_sum_basis
-from .unscented import UnscentedFilter, UnscentedUpdate
+from .tuning.error_scale import ErrorScale
+from .tuning.failures import Repaired, Replacement, replace_failed
+from .tuning.learned_gain import LearnedGain
+from .tuning.parameters import Augmentation, Parameter
+from .tuning.spread_match import SpreadMatch
 
 __all__ = [
     "ETKF",

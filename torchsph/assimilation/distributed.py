@@ -16,7 +16,7 @@ import torch.distributed as dist
 from torch import Tensor
 
 from .errors import AssimilationError
-from .filters import Analysis, Filter
+from .filters.base import Analysis, Filter
 from .observations import Observations, Screened
 
 

@@ -1,7 +1,7 @@
 """Pair sums over neighbouring particles behind one interface, with interchangeable backends."""
 
+from .backends.reference import ReferenceBackend
 from .interface import Backend, Moments, MomentumTerms, PairState, Rates, RateTerms, Support
-from .reference import ReferenceBackend
 from .registry import available_backends, backend
 
 __all__ = [

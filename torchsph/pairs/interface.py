@@ -16,8 +16,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..smoothing import SmoothingKernel
 from .poisson import PoissonProblem, PoissonSolution, solve
+from .smoothing_kernels import SmoothingKernel
 
 CONTINUITY_FORMS = ("volume", "mass")
 PRESSURE_FORMS = ("symmetric", "sum", "switched", "difference")

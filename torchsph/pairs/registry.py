@@ -6,11 +6,12 @@ from dataclasses import dataclass
 
 import torch
 
-from . import cuda
-from .cpu import CpuBackend
+from torchsph.native.library import LibraryMissing, library
+
+from .backends import triton_backend as cuda
+from .backends.cpu import CpuBackend
+from .backends.reference import ReferenceBackend
 from .interface import Backend
-from .native import LibraryMissing, library
-from .reference import ReferenceBackend
 
 
 @dataclass(frozen=True)

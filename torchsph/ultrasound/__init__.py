@@ -4,20 +4,20 @@ Simulation (flow, scatterers, image, echoes) and estimation (clutter, tracking, 
 alone: no estimator imports the simulator. Measurements join the two on a recording.
 """
 
-from .acquisition import Acquisition, Beams, Packet
-from .calibration import Calibration, fit_calibration
-from .clutter import ClutterFilter, FIRFilter, PolynomialFilter, SVDFilter
-from .doppler import ColourDoppler, DopplerEstimates, colour_doppler, vector_doppler
-from .doppler_measurement import DopplerOptions, measure_doppler
-from .echoes import EchoModel, simulate_packet
-from .estimates import Estimates, Flag
-from .flow import Flow, LinearFlow, RecordingFlow
-from .noise import NoiseModel, measure_noise
-from .plugin import LibraryTracker, Tracker
-from .pointspread import GaussianPointSpread, PointSpread, SampledPointSpread, SectorPointSpread
-from .speckle_measurement import SpeckleOptions, measure_speckle
-from .tracking import SpeckleTracker, track
-from .training import SwirlFlow, TrainingPlan, calibrate, random_scene, random_swirl
+from .estimation.clutter import ClutterFilter, FIRFilter, PolynomialFilter, SVDFilter
+from .estimation.doppler import ColourDoppler, DopplerEstimates, colour_doppler, vector_doppler
+from .estimation.estimates import Estimates, Flag
+from .estimation.plugin import LibraryTracker, Tracker
+from .estimation.tracking import SpeckleTracker, track
+from .measurements.calibration import Calibration, fit_calibration
+from .measurements.doppler import DopplerOptions, measure_doppler
+from .measurements.noise import NoiseModel, measure_noise
+from .measurements.speckle import SpeckleOptions, measure_speckle
+from .measurements.training import SwirlFlow, TrainingPlan, calibrate, random_scene, random_swirl
+from .scanner.acquisition import Acquisition, Beams, Packet
+from .scanner.echoes import EchoModel, simulate_packet
+from .scanner.flow import Flow, LinearFlow, RecordingFlow
+from .scanner.pointspread import GaussianPointSpread, PointSpread, SampledPointSpread, SectorPointSpread
 from .uff import UffVolumes, read_uff, write_uff
 
 __all__ = [

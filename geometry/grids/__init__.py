@@ -1,0 +1,1 @@
+"""Regular grids and the fields on them."""

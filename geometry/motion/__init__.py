@@ -1,0 +1,1 @@
+"""Walls that move, and what is found on them: points, orifices, moving distance."""

@@ -1,0 +1,1 @@
+"""Recordings: the class, the rules of the file, reading and writing."""

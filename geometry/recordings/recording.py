@@ -1,0 +1,198 @@
+"""A recording: velocity volumes on a regular grid over time, with the walls and valves around the blood.
+
+Truths, measurements, forecasts and analyses are all recordings. In memory as in the file, grid arrays are
+indexed `[time, component, z, y, x]`, components in the order x, y, z, all in SI units; a plane recording
+drops the z axis.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+
+from geometry.grids.grid import Grid
+from geometry.surfaces.surface import Surface
+
+from .rules import check, check_shapes
+
+# Field of `Recording` (after a dot: of its wall), dataset, type in memory and in the file.
+LAYOUT: tuple[tuple[str, str, type], ...] = (
+    ("time", "/time", np.float64),
+    ("velocity", "/velocity", np.float32),
+    ("mask", "/mask", np.bool_),
+    ("weight", "/weight", np.float32),
+    ("sigma", "/sigma", np.float32),
+    ("uncovered", "/uncovered", np.int64),
+    ("beam", "/beam", np.float32),
+    ("pressure", "/pressure", np.float32),
+    ("wall.vertices", "/wall/vertices", np.float64),
+    ("wall.faces", "/wall/faces", np.int32),
+    ("wall.region", "/wall/region", np.uint8),
+    ("wall.velocity", "/wall/velocity", np.float32),
+    ("valve_intervals", "/valve/intervals", np.float64),
+    ("valve_open", "/valve_open", np.uint8),
+    ("volume", "/volume", np.float64),
+    ("flux_mitral", "/flux/mitral", np.float64),
+    ("flux_aortic", "/flux/aortic", np.float64),
+)
+REQUIRED = ("/time", "/velocity", "/mask", "/wall/vertices", "/wall/faces", "/wall/region")
+
+
+@dataclass(frozen=True, eq=False)
+class Wall:
+    """The closed surface around the blood at every frame, same faces throughout.
+
+    `vertices` `(T, nv, D)` or, at rest, `(nv, D)`, m; `faces` `(nf, D)`, outward; `region` `(nf,)`: 0 wall, 1
+    mitral inlet, 2 aortic outlet, further ones free; `velocity` `(T, nv, D)`, m/s, or None, then it follows
+    from `vertices`.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    region: np.ndarray
+    velocity: np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        _coerce(self, "wall.")
+
+    @property
+    def moves(self) -> bool:
+        """Whether there is one set of vertices for each frame."""
+        return self.vertices.ndim == 3
+
+    def at(self, frame: int) -> Surface:
+        """The surface at a frame."""
+        return Surface(self.vertices[frame] if self.moves else self.vertices, self.faces, self.region)
+
+    def select(self, frames: slice | Sequence[int] | np.ndarray) -> Wall:
+        """The wall at some of the frames."""
+        vertices = self.vertices[frames] if self.moves else self.vertices
+        return replace(self, vertices=vertices, velocity=None if self.velocity is None else self.velocity[frames])
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """Velocity volumes with their walls and valves; `None` stands for an optional dataset that is not there.
+
+    `time` (T,) s; `velocity` (T, D, *shape) m/s; `mask` (T, *shape) bool, one mask `shape` is repeated for
+    every frame; `rho` kg/m^3; `mu` Pa s; `period` s, 0 = not periodic; `weight` (T, *shape) in [0, 1];
+    `sigma` (T, D, *shape) m/s; `uncovered` (T,) nodes; `beam` (T, D, *shape) or (D, *shape) unit vectors;
+    `pressure` (T, *shape) Pa; `valve_intervals` (n, 3) rows (region, opens, closes), s; `valve_open` (T, 2);
+    `volume` (T,) m^3; `flux_mitral`, `flux_aortic` (T,) m^3/s, positive into the ventricle.
+
+    Raises RecordingError where shapes disagree; `check` tests every rule of the format.
+    """
+
+    time: np.ndarray
+    grid: Grid
+    velocity: np.ndarray
+    mask: np.ndarray
+    wall: Wall
+    rho: float
+    mu: float
+    period: float = 0.0
+    description: str = ""
+    weight: np.ndarray | None = None
+    sigma: np.ndarray | None = None
+    uncovered: np.ndarray | None = None
+    beam: np.ndarray | None = None
+    pressure: np.ndarray | None = None
+    valve_intervals: np.ndarray | None = None
+    valve_open: np.ndarray | None = None
+    volume: np.ndarray | None = None
+    flux_mitral: np.ndarray | None = None
+    flux_aortic: np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        _coerce(self, "")
+        for name in ("rho", "mu", "period"):
+            object.__setattr__(self, name, float(getattr(self, name)))
+        if self.mask.shape == self.grid.shape:
+            object.__setattr__(self, "mask", np.broadcast_to(self.mask, (len(self.time), *self.grid.shape)))
+        check_shapes(self)
+
+    @property
+    def dimension(self) -> int:
+        """2 for a plane recording, else 3."""
+        return self.grid.dimension
+
+    @property
+    def frames(self) -> int:
+        """Number of frames, T."""
+        return len(self.time)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """The arrays that are there, by the name of their dataset in the file."""
+        found = {}
+        for name, dataset, _ in LAYOUT:
+            value = getattr(self.wall, name[5:]) if name.startswith("wall.") else getattr(self, name)
+            if value is not None:
+                found[dataset] = value
+        return found
+
+    def check(self, source: str = "recording") -> None:
+        """Raise RecordingError for the first rule of the format that is broken; `source` opens the text."""
+        check(self, source)
+
+    def select(self, frames: slice | Sequence[int] | np.ndarray) -> Recording:
+        """Some of the frames, in increasing order of time: a slice, frame numbers or a bool for each frame.
+
+        The period stays what it is: frames left out do not change the motion that they sample.
+        """
+        chosen = np.arange(self.frames)[frames if isinstance(frames, slice) else np.asarray(frames)]
+        changes: dict[str, object] = {"wall": self.wall.select(chosen)}
+        for name, _, _ in LAYOUT:
+            value = None if name.startswith("wall.") else getattr(self, name)
+            still = name == "valve_intervals" or (
+                name == "beam" and value is not None and value.ndim == self.dimension + 1
+            )
+            if value is not None and not still:
+                changes[name] = value[chosen]
+        return replace(self, **changes)
+
+    def with_velocity(
+        self,
+        velocity: np.ndarray,
+        *,
+        sigma: np.ndarray | None = None,
+        uncovered: np.ndarray | None = None,
+        description: str | None = None,
+    ) -> Recording:
+        """Another velocity (T, D, *shape), m/s, between the same walls: an analysis or a forecast.
+
+        What belonged to the old velocity (weight, sigma, beam, pressure, fluxes) is dropped.
+        """
+        gone = dict.fromkeys(("weight", "beam", "pressure", "flux_mitral", "flux_aortic"))
+        text = self.description if description is None else description
+        return replace(self, velocity=velocity, sigma=sigma, uncovered=uncovered, description=text, **gone)
+
+    def valve_intervals_or_derived(self) -> np.ndarray:
+        """Rows (region, opens, closes), `(n, 3)`, s: `/valve/intervals`, or else derived from `/valve_open`.
+
+        A change seen between two frames took place midway between them; a valve that is open at the first
+        frame opens at -inf, one open at the last frame closes at +inf, because the recording does not say
+        when. No rows where the recording has neither.
+        """
+        if self.valve_intervals is not None:
+            return self.valve_intervals
+        if self.valve_open is None:
+            return np.zeros((0, 3))
+        edges = np.concatenate([[-np.inf], 0.5 * (self.time[1:] + self.time[:-1]), [np.inf]])
+        rows = []
+        for region in (1, 2):
+            state = np.concatenate([[0], self.valve_open[:, region - 1].astype(np.int8), [0]])
+            change = np.diff(state)
+            for opens, closes in zip(np.flatnonzero(change == 1), np.flatnonzero(change == -1), strict=True):
+                rows.append((region, edges[opens], edges[closes]))
+        return np.array(rows, dtype=np.float64).reshape(-1, 3)
+
+
+def _coerce(instance: Wall | Recording, prefix: str) -> None:
+    """Bring every array to its type; a recording keeps no reference to lists or other array types."""
+    kinds = {name.removeprefix(prefix): kind for name, _, kind in LAYOUT if name.startswith(prefix)}
+    for item in fields(instance):
+        value = getattr(instance, item.name)
+        if item.name in kinds and value is not None:
+            object.__setattr__(instance, item.name, np.asarray(value, dtype=kinds[item.name]))

@@ -1,0 +1,228 @@
+"""The rules of the recording file, each with a message that names the dataset, the rule broken and the cure.
+
+A rule is stated once, here, and holds for a recording that was read as well as for one about to be written.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from geometry.surfaces.surface import SurfaceError
+
+if TYPE_CHECKING:
+    from .recording import Recording
+
+FASTEST = 20.0  # m/s; blood never is as fast, so larger numbers are mm/s or cm/s
+
+
+class RecordingError(ValueError):
+    """A recording, in a file or in memory, breaks a rule of the format."""
+
+    def __init__(self, source: str, dataset: str, rule: str) -> None:
+        super().__init__(f"{source}: {dataset}: {rule}")
+        self.source, self.dataset, self.rule = source, dataset, rule
+
+    def __reduce__(self) -> tuple[type, tuple[str, str, str]]:
+        """Errors cross processes by pickling, which would hand the whole message to `source`."""
+        return type(self), (self.source, self.dataset, self.rule)
+
+
+def check(recording: Recording, source: str = "recording") -> None:
+    """Raise RecordingError for the first rule that is broken; `source`, say the file, opens the message."""
+    check_shapes(recording, source)
+    for rule in (
+        _constants,
+        _time,
+        _weight,
+        _finite,
+        _wall,
+        _speed,
+        _sigma,
+        _beam,
+        _overlap,
+        _valves,
+        _series,
+    ):
+        rule(recording, source)
+
+
+def check_shapes(recording: Recording, source: str = "recording") -> None:
+    """Ranks and sizes that must agree: time, grid, wall and valves against each other."""
+    arrays = recording.arrays()
+    if recording.time.ndim != 1 or recording.time.size == 0:
+        raise RecordingError(source, "/time", f"must be (T,) with at least one frame, not {recording.time.shape}")
+    for dataset, shapes in allowed_shapes(recording).items():
+        if dataset in arrays and arrays[dataset].shape not in shapes:
+            wanted = " or ".join(str(shape) for shape in shapes)
+            rule = f"has the shape {arrays[dataset].shape}, but others in the recording ask for {wanted}"
+            raise RecordingError(source, dataset, rule)
+
+
+def allowed_shapes(recording: Recording) -> dict[str, tuple[tuple[int, ...], ...]]:
+    """The shapes that each dataset may have, given the frames, the grid and the size of the wall."""
+    frames, dimension, shape = recording.time.shape[0], recording.grid.dimension, recording.grid.shape
+    wall, intervals = recording.wall, recording.valve_intervals
+    points = (wall.vertices.shape[-2] if wall.vertices.ndim in (2, 3) else 0, dimension)
+    faces = wall.faces.shape[0] if wall.faces.ndim else 0
+    return {
+        "/velocity": ((frames, dimension, *shape),),
+        "/mask": ((frames, *shape),),
+        "/weight": ((frames, *shape),),
+        "/sigma": ((frames, dimension, *shape),),
+        "/uncovered": ((frames,),),
+        "/beam": ((frames, dimension, *shape), (dimension, *shape)),
+        "/pressure": ((frames, *shape),),
+        "/wall/vertices": ((frames, *points), points),
+        "/wall/faces": ((faces, dimension),),
+        "/wall/region": ((faces,),),
+        "/wall/velocity": ((frames, *points),),
+        "/valve/intervals": ((len(intervals) if intervals is not None and intervals.ndim else 0, 3),),
+        "/valve_open": ((frames, 2),),
+        "/volume": ((frames,),),
+        "/flux/mitral": ((frames,),),
+        "/flux/aortic": ((frames,),),
+    }
+
+
+def measured_nodes(recording: Recording) -> np.ndarray:
+    """Nodes `(T, *shape)` that carry a value: inside the mask and not of weight 0."""
+    return recording.mask if recording.weight is None else recording.mask & (recording.weight > 0)
+
+
+def _constants(recording: Recording, source: str) -> None:
+    if not (np.isfinite(recording.rho) and recording.rho > 0):
+        raise RecordingError(source, "attribute rho", f"must be a positive density in kg/m^3, not {recording.rho}")
+    for name, unit in (("mu", "Pa s"), ("period", "s; 0 = not periodic")):
+        value = getattr(recording, name)
+        if not (np.isfinite(value) and value >= 0):
+            raise RecordingError(source, f"attribute {name}", f"must be finite and not negative ({unit}), not {value}")
+
+
+def _time(recording: Recording, source: str) -> None:
+    time = recording.time
+    if not np.isfinite(time).all():
+        raise RecordingError(source, "/time", "must be finite, in seconds")
+    falling = np.diff(time) <= 0
+    if falling.any():
+        frame = int(np.argmax(falling))
+        rule = f"must increase strictly, but frame {frame} at {time[frame]:g} s precedes {time[frame + 1]:g} s"
+        raise RecordingError(source, "/time", f"{rule}; sort the frames and drop repeated ones")
+
+
+def _weight(recording: Recording, source: str) -> None:
+    if recording.weight is None:
+        return
+    bad = ~((recording.weight >= 0) & (recording.weight <= 1))  # written so that NaN is bad as well
+    if bad.any():
+        rule = f"must lie in [0, 1], but is {recording.weight[bad][0]:g} at {_first(bad)}"
+        raise RecordingError(source, "/weight", f"{rule}; rescale it, and use 0 where nothing was measured")
+
+
+def _finite(recording: Recording, source: str) -> None:
+    measured, components = measured_nodes(recording), -1 - recording.dimension
+    for dataset in ("/velocity", "/sigma", "/beam", "/pressure"):
+        field = recording.arrays().get(dataset)
+        if field is None:
+            continue
+        finite = np.isfinite(field) if dataset == "/pressure" else np.isfinite(field).all(axis=components)
+        bad = measured & ~finite
+        if bad.any():
+            rule = f"must be finite inside the mask, but is not at {int(bad.sum())} nodes, as at {_first(bad)}"
+            raise RecordingError(source, dataset, f"{rule}; take them out of /mask or give them /weight 0")
+
+
+def _speed(recording: Recording, source: str) -> None:
+    with np.errstate(invalid="ignore", over="ignore"):
+        speed = np.sqrt((recording.velocity.astype(np.float64) ** 2).sum(axis=1))
+        wall = recording.wall.velocity
+        moving = np.zeros(0) if wall is None else np.sqrt((wall.astype(np.float64) ** 2).sum(axis=-1))
+    inside = speed[measured_nodes(recording)]
+    for dataset, values in (("/velocity", inside), ("/wall/velocity", moving)):
+        if values.size and not values.max() <= FASTEST:
+            rule = f"reaches {values.max():g}, above {FASTEST:g} m/s, so it is probably in mm/s or cm/s"
+            raise RecordingError(source, dataset, f"{rule}; convert it to m/s")
+
+
+def _sigma(recording: Recording, source: str) -> None:
+    if recording.sigma is None:
+        return
+    bad = (recording.sigma < 0).any(axis=1) & measured_nodes(recording)
+    if bad.any():
+        rule = f"is a standard deviation in m/s and must not be negative, as at {_first(bad)}"
+        raise RecordingError(source, "/sigma", rule)
+
+
+def _beam(recording: Recording, source: str) -> None:
+    if recording.beam is None:
+        return
+    length = np.sqrt((recording.beam.astype(np.float64) ** 2).sum(axis=-1 - recording.dimension))
+    bad = measured_nodes(recording) & (np.abs(length - 1) > 1e-3)
+    if bad.any():
+        rule = f"must hold unit vectors, but does not at {_first(bad)}; divide by their length"
+        raise RecordingError(source, "/beam", rule)
+
+
+def _wall(recording: Recording, source: str) -> None:
+    wall = recording.wall
+    for dataset, values in (("/wall/vertices", wall.vertices), ("/wall/velocity", wall.velocity)):
+        if values is not None and not np.isfinite(values).all():
+            raise RecordingError(source, dataset, "must be finite everywhere")
+    if len(wall.faces) == 0:
+        raise RecordingError(source, "/wall/faces", "holds no face, so there is no surface around the blood")
+    try:
+        first = wall.at(0)
+        first.check()
+    except SurfaceError as fault:
+        raise RecordingError(source, "/wall/faces", str(fault)) from fault
+    # Closedness is a matter of the faces alone; only the orientation may change in later frames.
+    sense = np.sign(first.component_volumes)
+    for frame in range(1, recording.frames if wall.moves else 1):
+        surface = first.moved(wall.vertices[frame])
+        if (np.sign(surface.component_volumes) != sense).any():
+            rule = f"the surface is inside out at frame {frame}, but not at frame 0"
+            raise RecordingError(source, "/wall/vertices", rule)
+
+
+def _overlap(recording: Recording, source: str) -> None:
+    used = recording.wall.vertices[..., np.unique(recording.wall.faces), :].reshape(-1, recording.dimension)
+    lower, upper = used.min(axis=0), used.max(axis=0)
+    grid = recording.grid
+    if (np.asarray(grid.origin) > upper).any() or (np.asarray(grid.upper) < lower).any():
+        rule = f"the box {_box(grid.origin, grid.upper)} does not overlap the wall's box {_box(lower, upper)}"
+        raise RecordingError(source, "/grid", f"{rule}; give both in metres in the same coordinates")
+
+
+def _valves(recording: Recording, source: str) -> None:
+    intervals = recording.valve_intervals
+    if intervals is not None:
+        if not np.isfinite(intervals).all():
+            raise RecordingError(source, "/valve/intervals", "must be finite: rows (region label, opens, closes)")
+        label = intervals[:, 0]
+        if ((label != np.rint(label)) | (label < 1)).any():
+            rule = f"its first column must hold region labels 1, 2, ..., not {label}"
+            raise RecordingError(source, "/valve/intervals", rule)
+        if (intervals[:, 2] <= intervals[:, 1]).any():
+            rule = "a valve must close after it opens: rows (region label, opening time, closing time)"
+            raise RecordingError(source, "/valve/intervals", rule)
+    if recording.valve_open is not None and (recording.valve_open > 1).any():
+        raise RecordingError(source, "/valve_open", "must hold 0 (closed) and 1 (open) only")
+
+
+def _series(recording: Recording, source: str) -> None:
+    for dataset in ("/volume", "/flux/mitral", "/flux/aortic"):
+        values = recording.arrays().get(dataset)
+        if values is not None and not np.isfinite(values).all():
+            raise RecordingError(source, dataset, "must be finite at every frame")
+    if recording.uncovered is not None and (recording.uncovered < 0).any():
+        raise RecordingError(source, "/uncovered", "counts nodes and must not be negative")
+
+
+def _first(bad: np.ndarray) -> str:
+    frame, *node = (int(number) for number in np.argwhere(bad)[0])
+    return f"frame {frame}, node {tuple(node)} (array order)"
+
+
+def _box(lower, upper) -> str:
+    return " x ".join(f"[{a:.4g}, {b:.4g}]" for a, b in zip(lower, upper, strict=True)) + " m"

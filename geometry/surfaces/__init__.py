@@ -1,0 +1,1 @@
+"""Closed surfaces: shapes, files, repair, segmentation, distance."""

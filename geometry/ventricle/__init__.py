@@ -1,0 +1,1 @@
+"""A parametric ventricle: its beat and its mesh."""

@@ -1,0 +1,1 @@
+"""B-splines on knot grids."""

@@ -1,0 +1,1 @@
+"""Compiled assembly and band algebra, on CPU and GPU."""

@@ -1,0 +1,1 @@
+"""Linear rows of the spline system and their numbering."""

@@ -1,0 +1,256 @@
+"""Linear rows of the spline system, matrix-free, each with its exact adjoint.
+
+A coefficient vector is a tensor (nodes, C) for C velocity components. Every row block maps it to its rows
+and back; blocks are stacked by :class:`System` into the matrix of thesis eq. 3.22. Rows, not squared terms,
+are scaled: a row of weight w contributes w^2 to the cost (ERRATA 3.10/3.16).
+"""
+
+from collections.abc import Iterator, Sequence
+from typing import Protocol
+
+import torch
+
+from regularize.basis.knots import Knots
+from regularize.errors import InvalidInput
+
+CHUNK = 4096  # points per pass: bounds the (points, local_size, C) buffers to a few megabytes
+
+
+class RowBlock(Protocol):
+    """What the solvers ask of a set of rows."""
+
+    target: torch.Tensor  # (rows,) right-hand side, already weighted
+
+    def matvec(self, c: torch.Tensor) -> torch.Tensor: ...  # (nodes, C) -> (rows,)
+
+    def rmatvec(self, r: torch.Tensor) -> torch.Tensor: ...  # (rows,) -> (nodes, C)
+
+
+class _PointRows:
+    """Shared bookkeeping of rows that live at points (n, A) inside the knot box."""
+
+    def __init__(self, knots: Knots, points: torch.Tensor, components: int) -> None:
+        if points.ndim != 2 or points.shape[1] != knots.axes:
+            raise InvalidInput(f"points have shape {tuple(points.shape)}: expected (n, {knots.axes})")
+        self.knots, self.components = knots, components
+        self.cell, self.t = knots.locate(points)
+
+    def __len__(self) -> int:
+        return len(self.cell)
+
+    def _chunks(self) -> Iterator[slice]:
+        for start in range(0, len(self.cell), CHUNK):
+            yield slice(start, min(start + CHUNK, len(self.cell)))
+
+    def rows_at(self, index: slice | torch.Tensor) -> torch.Tensor:
+        """(n, local_size, C) values of coupled rows; (n, local_size) of component-wise ones; unweighted."""
+        raise NotImplementedError
+
+
+class VectorRows(_PointRows):
+    """Rows w_ik v_k(x_i) = w_ik target_ik, one per point and component (the matrix S of thesis eq. 3.7)."""
+
+    def __init__(self, knots: Knots, points: torch.Tensor, target: torch.Tensor, weight: torch.Tensor) -> None:
+        super().__init__(knots, points, target.shape[1])
+        self.weight = weight.expand(target.shape)
+        self.target = (self.weight * target).flatten()
+
+    def rows_at(self, index: slice | torch.Tensor) -> torch.Tensor:
+        return self.knots.stencil(self.t[index])
+
+    def matvec(self, c: torch.Tensor) -> torch.Tensor:
+        out = torch.empty(len(self), self.components, dtype=c.dtype, device=c.device)
+        for part in self._chunks():
+            near = c[self.knots.local_nodes(self.cell[part])]
+            out[part] = torch.einsum("nl,nlc->nc", self.rows_at(part).to(c.dtype), near)
+        return (self.weight.to(c.dtype) * out).flatten()
+
+    def rmatvec(self, r: torch.Tensor) -> torch.Tensor:
+        r = self.weight.to(r.dtype) * r.view(len(self), self.components)
+        out = torch.zeros(self.knots.nodes, self.components, dtype=r.dtype, device=r.device)
+        for part in self._chunks():
+            values = self.rows_at(part).to(r.dtype)[:, :, None] * r[part][:, None, :]
+            out.index_add_(0, self.knots.local_nodes(self.cell[part]).flatten(), values.flatten(0, 1))
+        return out
+
+    def with_target(self, target: torch.Tensor) -> "VectorRows":
+        """The same rows for other sample values (n, C)."""
+        other = object.__new__(VectorRows)
+        other.__dict__.update(self.__dict__)
+        other.target = (self.weight * target).flatten()
+        return other
+
+    def with_weight(self, factor: torch.Tensor | float) -> "VectorRows":
+        """The same rows with all weights multiplied by ``factor``, a number or (n, 1)."""
+        other = object.__new__(VectorRows)
+        other.__dict__.update(self.__dict__)
+        other.weight = self.weight * factor
+        other.target = (self.target.view(other.weight.shape) * factor).flatten()
+        return other
+
+    def detached(self) -> "VectorRows":
+        """The same rows without their autograd graph."""
+        other = object.__new__(VectorRows)
+        other.__dict__.update(self.__dict__)
+        other.weight, other.target = self.weight.detach(), self.target.detach()
+        return other
+
+    def with_unit_weight(self) -> "VectorRows":
+        """The same points with weight 1 (and no meaningful target)."""
+        other = self.detached()
+        other.weight = torch.ones_like(other.weight)
+        return other
+
+    def repeated(self, count: int) -> "VectorRows":
+        """The same rows, of one weight per point, for ``count`` components and no target."""
+        other = object.__new__(VectorRows)
+        other.__dict__.update(self.__dict__)
+        other.components, other.weight = count, self.weight[:, :1].expand(-1, count)
+        other.target = torch.zeros(len(self) * count, dtype=self.target.dtype)
+        return other
+
+    def component(self, k: int) -> "VectorRows":
+        """The rows of one component, as rows of a scalar field."""
+        one = object.__new__(VectorRows)
+        one.knots, one.components, one.cell, one.t = self.knots, 1, self.cell, self.t
+        one.weight = self.weight[:, k : k + 1]
+        one.target = self.target.view(len(self), -1)[:, k].clone()
+        return one
+
+
+class _CoupledRows(_PointRows):
+    """One row per point, touching all components of the local coefficients."""
+
+    def __init__(
+        self, knots: Knots, points: torch.Tensor, components: int, target: torch.Tensor, weight: torch.Tensor
+    ) -> None:
+        super().__init__(knots, points, components)
+        self.weight = weight.expand(len(points))
+        self.target = self.weight * target
+
+    def matvec(self, c: torch.Tensor) -> torch.Tensor:
+        out = torch.empty(len(self), dtype=c.dtype, device=c.device)
+        for part in self._chunks():
+            near = c[self.knots.local_nodes(self.cell[part])]
+            out[part] = (self.rows_at(part).to(c.dtype) * near).sum(dim=(1, 2))
+        return self.weight.to(c.dtype) * out
+
+    def rmatvec(self, r: torch.Tensor) -> torch.Tensor:
+        r = self.weight.to(r.dtype) * r
+        out = torch.zeros(self.knots.nodes, self.components, dtype=r.dtype, device=r.device)
+        for part in self._chunks():
+            values = self.rows_at(part).to(r.dtype) * r[part][:, None, None]
+            out.index_add_(0, self.knots.local_nodes(self.cell[part]).flatten(), values.flatten(0, 1))
+        return out
+
+
+class DirectionRows(_CoupledRows):
+    """Rows w_i d_i . v(x_i): wall normals (thesis eq. 3.21), Doppler beams. direction (n, C), target (n,)."""
+
+    def __init__(
+        self,
+        knots: Knots,
+        points: torch.Tensor,
+        direction: torch.Tensor,
+        target: torch.Tensor,
+        weight: torch.Tensor,
+    ) -> None:
+        super().__init__(knots, points, direction.shape[1], target, weight)
+        self.direction = direction
+
+    def rows_at(self, index: slice | torch.Tensor) -> torch.Tensor:
+        return self.knots.stencil(self.t[index])[:, :, None] * self.direction[index][:, None, :]
+
+
+class DivergenceRows(_CoupledRows):
+    """Rows w_i div v(x_i) = 0, derivatives per metre (thesis eq. 3.13)."""
+
+    def __init__(self, knots: Knots, points: torch.Tensor, components: int, weight: torch.Tensor) -> None:
+        super().__init__(knots, points, components, torch.zeros_like(points[:, 0]), weight)
+
+    def rows_at(self, index: slice | torch.Tensor) -> torch.Tensor:
+        axes, t = self.knots.axes, self.t[index]
+        columns = [self.knots.stencil(t, [int(a == k) for a in range(axes)]) for k in range(self.components)]
+        return torch.stack(columns, dim=-1)
+
+
+class CellRows:
+    """The same rows in every listed knot cell: integrals of squared derivatives over these cells.
+
+    ``factor`` is (rows, local_size) and applied to each component, or (rows, local_size, C) and
+    coupling them; its Gram matrix is the integral over one cell (see ``penalties``).
+    """
+
+    def __init__(self, knots: Knots, cells: torch.Tensor, factor: torch.Tensor, components: int) -> None:
+        self.knots, self.cell, self.components = knots, cells, components
+        self.factor = factor
+        self.coupled = factor.ndim == 3
+        self.nodes = knots.local_nodes(cells)
+        rows = len(cells) * len(factor) * (1 if self.coupled else components)
+        self.target = torch.zeros(rows, dtype=factor.dtype, device=factor.device)
+
+    def matvec(self, c: torch.Tensor) -> torch.Tensor:
+        near, factor = c[self.nodes], self.factor.to(c.dtype)
+        if self.coupled:
+            return (near.flatten(1) @ factor.flatten(1).T).flatten()
+        return torch.einsum("rl,nlc->nrc", factor, near).flatten()
+
+    def rmatvec(self, r: torch.Tensor) -> torch.Tensor:
+        count, factor = len(self.cell), self.factor.to(r.dtype)
+        if self.coupled:
+            values = (r.view(count, -1) @ factor.flatten(1)).view(-1, self.components)
+        else:
+            values = torch.einsum("rl,nrc->nlc", factor, r.view(count, len(factor), -1)).flatten(0, 1)
+        out = torch.zeros(self.knots.nodes, self.components, dtype=r.dtype, device=r.device)
+        return out.index_add_(0, self.nodes.flatten(), values)
+
+    def repeated(self, count: int) -> "CellRows":
+        """The same uncoupled rows for ``count`` components."""
+        return CellRows(self.knots, self.cell, self.factor, count)
+
+
+class System:
+    """Stacked row blocks with damping: minimise |A c - b|^2 + damping^2 |c|^2 (thesis eq. 3.22)."""
+
+    def __init__(self, knots: Knots, components: int, blocks: Sequence[RowBlock], damping: float) -> None:
+        if not blocks:
+            raise InvalidInput("the system has no rows: give samples, walls or penalties")
+        self.knots, self.components = knots, components
+        self.blocks, self.damping = list(blocks), float(damping)
+        self._sizes = [len(block.target) for block in self.blocks]
+
+    @property
+    def unknowns(self) -> int:
+        return self.knots.nodes * self.components
+
+    def target(self) -> torch.Tensor:
+        return torch.cat([block.target for block in self.blocks])
+
+    def matvec(self, x: torch.Tensor) -> torch.Tensor:
+        """(unknowns,) -> (rows,)."""
+        c = x.view(self.knots.nodes, self.components)
+        return torch.cat([block.matvec(c) for block in self.blocks])
+
+    def rmatvec(self, r: torch.Tensor) -> torch.Tensor:
+        """(rows,) -> (unknowns,), the exact adjoint of :meth:`matvec`."""
+        parts = r.split(self._sizes)
+        return sum(block.rmatvec(part) for block, part in zip(self.blocks, parts, strict=True)).flatten()
+
+    def right_side(self) -> torch.Tensor:
+        """A' b, float64."""
+        return self.rmatvec(self.target().double())
+
+    def gradient(self, x: torch.Tensor) -> torch.Tensor:
+        """A'(b - A x) - damping^2 x recomputed in float64, half the negative gradient of the cost."""
+        x = x.double()
+        return self.rmatvec(self.target().double() - self.matvec(x)) - self.damping**2 * x
+
+    def touched(self) -> torch.Tensor:
+        """(nodes,) bool: coefficients in some row's support. The others stay exactly zero."""
+        used = torch.zeros(self.knots.nodes, dtype=torch.bool, device=self.blocks[0].target.device)
+        used[self.knots.local_nodes(self.knots.cell_index(self.cells())).flatten()] = True
+        return used
+
+    def cells(self) -> torch.Tensor:
+        """Sorted flat numbers of the cells that hold rows."""
+        return torch.unique(torch.cat([self.knots.cell_number(block.cell) for block in self.blocks]))

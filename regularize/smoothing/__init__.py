@@ -1,0 +1,1 @@
+"""The smoother: options, samples, rows, the search for smoothness, fits over time."""

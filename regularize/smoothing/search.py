@@ -1,0 +1,72 @@
+"""The automatic choice for one set of samples: row groups on a coarser grid, and the search on them."""
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import torch
+
+from regularize.basis.knots import Knots
+from regularize.rows.operators import CellRows, DivergenceRows, VectorRows
+from regularize.rows.penalties import row_factor
+from regularize.solvers.direct import solve_direct
+from regularize.statistics.gcv import cross_validate
+from regularize.statistics.likelihood import Choice, Groups, LikelihoodSearch
+
+from .problem import Problem
+from .row_blocks import build_system, penalty_blocks, smoothness_gram, wall_roots
+from .samples import FitData
+
+if TYPE_CHECKING:
+    from .smoother import Smoother
+
+FEWEST = 30  # below this the estimates scatter by more than the choice could gain
+
+
+def choose(options: "Smoother", knots: Knots, data: FitData) -> Choice | None:
+    """Choose noise levels, curvature, no_slip and robust factors for ``data`` (see ``likelihood``).
+
+    None where there is nothing to choose from: fewer than FEWEST samples, or no flow at all.
+    """
+    data = data.cpu()  # small dense work, and LAPACK's banded routines
+    guess = 0.5 * float(data.velocity.double().square().mean().sqrt())
+    if len(data.points) < FEWEST or guess == 0:
+        return None
+    spacing = [options.search_knots * h for h in knots.spacing]
+    upper = [o + h * n for o, h, n in zip(knots.origin, knots.spacing, knots.cells, strict=True)]
+    coarse = Knots.covering(knots.origin, upper, spacing, knots.degree)
+    fit = VectorRows(coarse, data.points, data.velocity, data.weight[:, None])
+    rest = options.fixed(no_slip=None, curvature=None, choose_divergence=False)
+    free = options.choose_divergence and bool(options.divergence)
+    rest = replace(rest, divergence=1.0) if free else rest
+    blocks, cells, damping = penalty_blocks(rest, coarse, data, [fit])
+    chosen = [block for block in blocks if free and isinstance(block, DivergenceRows | CellRows)]
+    slip = None
+    if options.no_slip and data.wall is not None and bool(data.wall.no_slip.any()):
+        wall, held = data.wall, data.wall.no_slip
+        slip = VectorRows(coarse, wall.points[held], wall.velocity[held], wall_roots(wall)[held, None])
+    factor = row_factor(smoothness_gram(options, coarse, data)) / data.extent(coarse) ** 0.5
+    groups = Groups(
+        options.order,
+        data.points,
+        data.velocity,
+        data.weight,
+        CellRows(coarse, cells, factor, 1),
+        slip,
+        chosen[0] if chosen else None,
+        [block for block in blocks if block not in chosen],
+        damping,
+    )
+    search = LikelihoodSearch(coarse, groups, options.robust)
+    with torch.no_grad():
+        if options.automatic == "gcv":
+            return cross_validate(search, options.no_slip, options.rounds)
+        choice = search.run(guess, options.curvature, options.no_slip, options.divergence, options.rounds)
+        return _counting_shared_errors(options, coarse, data, choice) if options.correlated else choice
+
+
+def _counting_shared_errors(options: "Smoother", coarse: Knots, data: FitData, choice: Choice) -> Choice:
+    """The choice with what neighbouring samples' errors are found to have in common in a fit on the search's grid."""
+    data = data.reweighed(choice)
+    problem = Problem(data, build_system(options.with_choice(choice), coarse, data), choice)
+    shared = problem.shared(*solve_direct(problem.system, strict=False))
+    return choice if shared is None else choice.counting(shared)

@@ -1,0 +1,1 @@
+"""What residuals tell: noise, outliers, correlation, smoothness, posterior."""

@@ -1,0 +1,1 @@
+"""Whether an ensemble tells the truth: scores, their record, its figure."""

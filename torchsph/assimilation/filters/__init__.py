@@ -1,0 +1,1 @@
+"""Ensemble filters and what they are made of."""

@@ -1,0 +1,1 @@
+"""What is run on a measurement, and how well forecasts do."""

@@ -1,0 +1,1 @@
+"""The cycle of the ensemble: forecast, observe, analyse, learn."""

@@ -1,0 +1,85 @@
+"""Later observations applied to earlier analyses: the fixed-lag ensemble smoother of the cycle."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchsph.assimilation import Analysis
+
+
+@dataclass(frozen=True)
+class Lagged:
+    """An earlier analysis: its frame, estimate (D, *shape), members' anomalies (N, D, *shape) and claim (D, *shape)."""
+
+    frame: int
+    control: Tensor
+    anomalies: Tensor
+    sigma: Tensor
+
+
+class LaggedAnalyses:
+    """The last ``lag`` analyses, moved by each later one (Evensen & van Leeuwen 2000; Cohn et al. 1994).
+
+    The filter's transform of the members is a linear map, and the same map improves the states that those members came
+    from: no backward pass, no model. What it moves the mean by is added to the estimate, what it takes from the
+    anomalies' deviation is taken from the claim. It is as good as the sampled correlation between members and their
+    past; ``EnsembleOptions.lag`` says what that is worth.
+    """
+
+    def __init__(self, lag: int) -> None:
+        self.kept: deque[Lagged] = deque(maxlen=lag)
+
+    def add(self, frame: int, control: Tensor, anomalies: Tensor, sigma: Tensor) -> None:
+        self.kept.append(Lagged(frame, control, anomalies - anomalies.mean(0), sigma))
+
+    def improved(self, analysis: Analysis, inside: Tensor, numbers: int) -> list[Lagged]:
+        """All that are kept as ``analysis`` improves them; ``take`` makes them the ones that are kept.
+
+        Args:
+            inside: (q,) nodes of the analysis. numbers: of its state that stand for them, D q; what follows them are
+                parameters, which earlier states do not hold. Nodes that have left the blood since stay as they are.
+        """
+        size = analysis.ensemble.shape[1]
+        return [_improved(one, analysis, inside, numbers, size) for one in self.kept]
+
+    def take(self, improved: list[Lagged]) -> None:
+        self.kept = deque(improved, self.kept.maxlen)
+
+    def replaced(self, member: int, donor: int) -> None:
+        """A failed member goes on as another: so does its past."""
+        for one in self.kept:
+            one.anomalies[member] = one.anomalies[donor]
+
+    def clear(self) -> None:
+        """After a new ensemble, whose members have no past."""
+        self.kept.clear()
+
+    def state(self) -> list[dict[str, Any]]:
+        return [dict(vars(one)) for one in self.kept]
+
+    def restore(self, state: list[dict[str, Any]]) -> None:
+        self.kept = deque((Lagged(**one) for one in state), self.kept.maxlen)
+
+
+def _improved(one: Lagged, analysis: Analysis, inside: Tensor, numbers: int, size: int) -> Lagged:
+    before = one.anomalies.flatten(2)[:, :, inside]
+    count, parts = before.shape[:2]
+    joint = torch.cat([before.flatten(1), before.new_zeros((count, size - numbers))], 1)
+    moved, reached = analysis.transform.apply(joint), analysis.transform.reached
+    moved = (moved if reached is None else torch.where(reached, moved, joint))[:, :numbers]
+    mean = moved.mean(0)
+    after = moved - mean
+    if analysis.rotation is not None:  # members stay matched
+        after = (analysis.rotation @ after.double()).to(moved.dtype)
+    after = after.reshape(before.shape)
+    shrunk = after.std(0) / before.std(0).clamp_min(torch.finfo(before.dtype).tiny)
+    control, anomalies, sigma = (part.clone() for part in (one.control, one.anomalies, one.sigma))
+    control.flatten(1)[:, inside] += mean.reshape(parts, -1)
+    anomalies.flatten(2)[:, :, inside] = after
+    sigma.flatten(1)[:, inside] *= shrunk.clamp(max=1.0)
+    return replace(one, control=control, anomalies=anomalies, sigma=sigma)

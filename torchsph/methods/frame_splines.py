@@ -1,0 +1,256 @@
+"""The rival: a penalised B-spline field for each frame of a measurement."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+import geometry
+import regularize
+
+from .runtime.parallel import shared
+from .wall_rows import wall_rows
+
+# noise and smoothness are chosen in every third frame and serve its neighbours: flow and noise change over tens of
+# milliseconds, and a choice costs four times a fit
+CHOICE_EVERY = 3
+
+
+def node_weights(recording: geometry.Recording, frame: int) -> np.ndarray:
+    """Confidence (*shape) of a frame's nodes: its weight, or one, inside the mask; 0 where the velocity is missing."""
+    mask = np.array(recording.mask[frame], bool)
+    ones = mask.astype(np.float32)
+    weight = ones if recording.weight is None else np.where(mask, recording.weight[frame], 0.0)
+    return np.where(np.isfinite(recording.velocity[frame]).all(0), weight, 0.0)
+
+
+def beam_at(recording: geometry.Recording, frame: int) -> np.ndarray | None:
+    """Unit vectors (D, *shape) along which alone a frame was measured, or None for full vectors."""
+    beam = recording.beam
+    return None if beam is None else np.ascontiguousarray(beam if beam.ndim == recording.dimension + 1 else beam[frame])
+
+
+class FrameSmoother:
+    """Spline fits of a recording's frames; neighbouring frames share what was chosen automatically.
+
+    Args:
+        recording: the measurement. smoother: options of the fit. choose_every: frames that share one choice.
+    """
+
+    def __init__(
+        self, recording: geometry.Recording, smoother: regularize.Smoother, choose_every: int = CHOICE_EVERY
+    ) -> None:
+        if choose_every < 1:
+            raise ValueError(f"choose_every must be at least 1, got {choose_every}")
+        if recording.beam is not None and smoother.automatic:
+            smoother = smoother.fixed()  # there is no automatic choice from one component along a beam
+        self.recording, self.smoother, self.choose_every = recording, smoother, choose_every
+        self.motion = geometry.WallMotion.from_recording(recording)
+        self.nodes = recording.grid.nodes()
+        self._choices: dict[int, regularize.Choice | None] = {}
+
+    def choice(self, frame: int) -> regularize.Choice | None:
+        """What was chosen for the middle frame of the frame's group, or the nearest to it that measured anything.
+
+        None for a smoother with fixed options, and where the whole group has no data.
+        """
+        if not self.smoother.automatic:
+            return None
+        group = frame // self.choose_every
+        if group not in self._choices:
+            first = group * self.choose_every
+            members = range(first, min(first + self.choose_every, self.recording.frames))
+            from_middle = sorted(members, key=lambda k: abs(k - first - self.choose_every // 2))
+            middle = next((k for k in from_middle if self.measures(k)), None)
+            self._choices[group] = None if middle is None else self._fit(middle).choice
+        return self._choices[group]
+
+    def fit(self, frame: int, *, uncertainty: bool = False) -> regularize.SplineField:
+        """The spline of one frame; ``uncertainty`` keeps what its standard deviation needs.
+
+        Raises ValueError where no node has a positive weight.
+        """
+        return self._fit(frame, uncertainty=uncertainty, choice=self.choice(frame))
+
+    def fit_increments(
+        self,
+        frame: int,
+        points: Tensor,
+        samples: Tensor,
+        weight: Tensor,
+        *,
+        choice: regularize.Choice | None = None,
+    ) -> list[regularize.SplineField]:
+        """Splines of increments (k, n, D) sampled at points (n, D) with confidences (n,); walls are at rest.
+
+        Noise, smoothness and outliers are chosen from the first of them, and the same linear estimate is made of the
+        others. ``choice``: noise and smoothness of an earlier increment; None chooses them as well.
+        """
+        return self._of_increments.fit_many(
+            points.double(),
+            samples.double(),
+            weight.double(),
+            self._resting(frame),
+            divergence_points=self._inside(frame),
+            choice=choice,
+            judged=0,
+        )
+
+    def fit_along(
+        self,
+        frame: int,
+        points: Tensor,
+        samples: Tensor,
+        weight: Tensor,
+        beam: Tensor,
+        choice: regularize.Choice | None = None,
+    ) -> regularize.SplineField:
+        """The spline of one increment that is known along unit vectors ``beam`` (n, D) alone.
+
+        Noise and smoothness are those of ``choice``, or the smoother's own.
+        """
+        known = {} if choice is None else {"curvature": choice.curvature, "no_slip": choice.no_slip}
+        return self._of_increments.fixed(**known).fit(
+            points.double(),
+            samples.double(),
+            weight.double(),
+            self._resting(frame),
+            divergence_points=self._inside(frame),
+            beam=beam,
+        )
+
+    @property
+    def _of_increments(self) -> regularize.Smoother:
+        # a forecast's errors reach as far as those that samples share: the ones would be taken for the others
+        return replace(self.smoother, correlated=False)
+
+    def _resting(self, frame: int) -> regularize.WallRows:
+        return wall_rows(self.recording, self.motion, frame, at_rest=True)
+
+    def _inside(self, frame: int) -> Tensor:
+        """(n, D) nodes in the mask of a frame."""
+        return self.nodes[torch.from_numpy(np.array(self.recording.mask[frame], bool).reshape(-1))]
+
+    def _fit(
+        self, frame: int, *, uncertainty: bool = False, choice: regularize.Choice | None = None
+    ) -> regularize.SplineField:
+        recording, dimension = self.recording, self.recording.dimension
+        mask = torch.from_numpy(np.array(recording.mask[frame], bool).reshape(-1))
+        weight = torch.from_numpy(node_weights(recording, frame).astype(np.float64).reshape(-1))
+        used = (weight > 0) & mask
+        if not bool(used.any()):
+            time = float(recording.time[frame])
+            raise ValueError(f"frame {frame} (t = {time:g} s) has no node with a positive weight inside the mask")
+        field = recording.velocity[frame].reshape(dimension, -1)
+        samples = torch.from_numpy(np.nan_to_num(field, copy=True)).double().T
+        return self.smoother.fit(
+            self.nodes[used],
+            samples[used],
+            weight[used],
+            wall_rows(recording, self.motion, frame),
+            divergence_points=self.nodes[mask],
+            beam=self._beam(frame, used),
+            uncertainty=uncertainty,
+            choice=choice,
+        )
+
+    @property
+    def groups(self) -> int:
+        """Number of groups of frames that share a choice."""
+        return -(-self.recording.frames // self.choose_every)
+
+    def fitted(
+        self, group: int, done: Callable[[], object] = lambda: None
+    ) -> tuple[regularize.Choice | None, dict[int, np.ndarray]]:
+        """What was chosen for a group, and the fields (D, *shape) of its frames; ``done`` is called after each."""
+        first, fields = group * self.choose_every, {}
+        for frame in range(first, min(first + self.choose_every, self.recording.frames)):
+            if self.measures(frame):
+                fields[frame] = self.on_grid(self.fit(frame), frame)
+            done()
+        return self._choices.get(group), fields
+
+    def adopt(self, group: int, choice: regularize.Choice | None) -> None:
+        """Take over what another process chose for a group."""
+        if self.smoother.automatic:
+            self._choices[group] = choice
+
+    def measures(self, frame: int) -> bool:
+        """Whether a frame has anything to fit."""
+        return bool((node_weights(self.recording, frame) > 0).any())
+
+    def draws(self, fitted: regularize.SplineField, frame: int, count: int, generator: torch.Generator) -> Tensor:
+        """(count, D, *shape) deviations from a fit of ``uncertainty=True``, drawn from its posterior; 0 outside.
+
+        Their RMS over the mask is that of the stated deviation, component by component.
+        """
+        recording = self.recording
+        mask = torch.from_numpy(np.array(recording.mask[frame], bool).reshape(-1))
+        out = torch.zeros((count, recording.dimension, recording.grid.size), dtype=torch.float64)
+        for one in out:
+            drawn = torch.zeros((fitted.knots.nodes, recording.dimension), dtype=torch.float64)
+            drawn[fitted.factor.ordering.nodes] = fitted.factor.sample(fitted.posterior.precision, generator)
+            coefficients = drawn.T.reshape(-1, *fitted.knots.shape)
+            one[:, mask] = regularize.SplineField(fitted.knots, coefficients, fitted.covered)(
+                self.nodes[mask], outside=0.0
+            ).T
+        # the factor knows independent errors alone; those that neighbours share make the stated deviation larger
+        stated = fitted.std(self.nodes[mask]).double().square().mean(0).sqrt()
+        own = out[:, :, mask].square().mean((0, 2)).sqrt().clamp_min(1e-300)
+        out *= (stated / own)[:, None]
+        return out.reshape(count, recording.dimension, *recording.grid.shape)
+
+    def _beam(self, frame: int, used: Tensor) -> Tensor | None:
+        """(n, D) directions of the used nodes, or None for full vectors."""
+        beam = beam_at(self.recording, frame)
+        return None if beam is None else torch.from_numpy(beam.reshape(self.recording.dimension, -1)).double().T[used]
+
+    def on_grid(self, fitted: regularize.SplineField, frame: int) -> np.ndarray:
+        """The field at the nodes (D, *shape) float32, 0 outside the mask."""
+        grid, mask = self.recording.grid, np.array(self.recording.mask[frame], bool).reshape(-1)
+        out = np.zeros((grid.dimension, grid.size), np.float32)
+        out[:, mask] = fitted(self.nodes[torch.from_numpy(mask)], outside=0.0).T.numpy()
+        return out.reshape(grid.dimension, *grid.shape)
+
+
+def smooth(
+    measured: geometry.Recording, smoother: regularize.Smoother | None = None, *, progress: bool = False
+) -> geometry.Recording:
+    """Fit every frame of a measurement by a penalised B-spline (thesis section 3.2).
+
+    Noise and smoothness are chosen automatically every few frames; outliers are judged in every frame.
+
+    Args:
+        measured: the measurement. smoother: options; None takes the default preset.
+        progress: show a bar on stderr (only on a terminal).
+
+    Returns:
+        A recording on the measurement's grid, mask and times.
+    """
+    return smooth_frames(FrameSmoother(measured, regularize.Smoother() if smoother is None else smoother), progress)
+
+
+def smooth_frames(frames: FrameSmoother, progress: bool = False) -> geometry.Recording:
+    """``smooth`` with a ``FrameSmoother`` of the caller's, who can then ask it what was chosen.
+
+    A frame in which nothing was measured has no spline: it holds 0 and counts as uncovered. Processes under torchrun
+    share the frames.
+    """
+    recording = frames.recording
+    fields = np.zeros(recording.velocity.shape, np.float32)
+    missing = np.array(
+        [0 if frames.measures(f) else np.count_nonzero(recording.mask[f]) for f in range(recording.frames)], np.int64
+    )
+    with tqdm(total=recording.frames, desc="spline", disable=None if progress else True, unit="frame") as bar:
+        groups = [partial(frames.fitted, group, bar.update) for group in range(frames.groups)]
+        for group, (choice, fitted) in enumerate(shared(groups)):
+            frames.adopt(group, choice)
+            for frame, field in fitted.items():
+                fields[frame] = field
+    return recording.with_velocity(fields, uncovered=missing, description="penalised B-spline, frame by frame")

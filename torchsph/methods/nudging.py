@@ -1,0 +1,90 @@
+"""The thesis's filter: one simulator runs along, each measured frame is imposed on it, the grid is fetched."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+import geometry
+import regularize
+from torchsph.simulator.simulator import Simulation, Simulator
+
+from .frame_splines import FrameSmoother, node_weights, smooth_frames
+from .measurement.error_model import ObservationError, estimate_error
+
+# share of the innovation's variance that the forecast keeps for itself at least: it is never believed blindly
+_LEAST_FORECAST_SHARE = 0.05
+
+
+@dataclass(frozen=True)
+class FilteredRun:
+    """What the filter made of a recording: the analyses and the accounts of the simulator."""
+
+    recording: geometry.Recording
+    info: dict[str, object]
+
+
+def filter_sph(
+    measured: geometry.Recording,
+    model: Simulator,
+    *,
+    error: ObservationError | None = None,
+    seed: int = 0,
+    progress: bool = False,
+) -> FilteredRun:
+    """Run one simulator through a recording and impose each frame on the running particles (thesis 3.1.6).
+
+    A particle's velocity v becomes  v + K (u - v)  with the measured u at its place (moving least squares over the
+    nodes, weighted by their confidence) and  K = P / (P + R):  R the measurement's error variance there, P the
+    forecast's, estimated at every frame from the innovations (their variance exceeds R by P).
+
+    Args:
+        measured: the recording. model: simulator of its scene. error: the measurement's error model (None: estimated).
+
+    Returns:
+        The fetched grid after each frame's update, on the measurement's grid, mask and times.
+    """
+    if error is None:
+        splines = FrameSmoother(measured, regularize.Smoother())
+        error = estimate_error(measured, splines, smooth_frames(splines, progress))
+    run = model.start(float(measured.time[0]), seed=seed)
+    fields, missing = [], []
+    frames = tqdm(range(measured.frames), desc="sph", unit="frame", disable=None if progress else True)
+    for frame in frames:
+        mask = torch.from_numpy(np.array(measured.mask[frame], bool)).to(model.device)
+        if frame:
+            run.advance(float(measured.time[frame]))
+        background = run.fetch(measured.grid, mask)
+        _update(run, measured, frame, error, background.value[0] if frame else None)
+        found = run.fetch(measured.grid, mask)
+        fields.append(found.value[0].cpu().numpy())
+        missing.append(int((mask & ~found.covered[0]).sum()))
+    recording = measured.with_velocity(
+        np.stack(fields),
+        uncovered=np.array(missing, np.int64),
+        description="one SPH simulation with every frame imposed on its particles",
+    )
+    return FilteredRun(recording, run.record.summary())
+
+
+def _update(
+    run: Simulation, measured: geometry.Recording, frame: int, error: ObservationError, background: Tensor | None
+) -> None:
+    """Pull the particles towards the measurement of one frame; the first frame has no forecast to weigh against."""
+    weight = node_weights(measured, frame)
+    variance = error.variance(measured, frame).mean(0)
+    observed = np.nan_to_num(measured.velocity[frame])
+    gain = np.ones_like(weight)
+    if background is not None:
+        used = weight > 0
+        innovation = (observed - background.cpu().numpy())[:, used]
+        total = float(np.mean(innovation**2)) if used.any() else 0.0
+        own = max(total - float(variance[used].mean()) if used.any() else 0.0, _LEAST_FORECAST_SHARE * total)
+        gain = own / (own + variance) if total > 0 else np.zeros_like(weight)
+    device, dtype = run.particles.position.device, run.particles.position.dtype
+    fields = torch.from_numpy(np.concatenate([observed, gain[None]])).to(device, dtype)
+    run.pull(measured.grid, fields[:-1], fields[-1], torch.from_numpy(weight).to(device, dtype))

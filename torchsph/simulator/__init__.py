@@ -1,0 +1,1 @@
+"""SPH: a scene and a scheme become a running batch of members."""

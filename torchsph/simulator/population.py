@@ -1,0 +1,283 @@
+"""Population control (thesis 5.2): particles that crowd are merged, holes are seeded again from what is around them.
+
+Mass and momentum only change hands: a merged particle has those of the two it replaces, a seeded one takes its share
+from the particles around it.  What flows through valves is left to the reservoirs and their accounts.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from torchsph.pairs.interface import Backend, Moments, Support, square_length
+from torchsph.pairs.smoothing_kernels import kernel
+
+from .imposing import first_order_value
+from .state.particles import FLUID, Particles
+from .state.record import Record
+
+if TYPE_CHECKING:
+    from .domain import Domain
+
+# particles that fill less of what encloses them have a free surface, beyond which there is nothing to seed
+_LEAST_FILLING = 0.9
+# new particles keep this far (spacings) from walls
+_CLEARANCE = 0.3
+# largest share of its mass that a particle gives away at once
+_LARGEST_GIFT = 0.4
+# offset of the neighbours' centre of mass (smoothing lengths) beyond which a fit would extrapolate
+_LARGEST_OFFSET = 0.5
+
+
+@dataclass(frozen=True)
+class PopulationControl:
+    """When particles are merged and seeded.
+
+    Attributes:
+        every: steps between one look and the next.
+        closest: particles nearer to each other than this (spacings) are merged, None: none are.
+        heaviest: but not to more than this mass, in those of a cubic spacing of fluid.
+        missing: an empty cell is seeded where at least so much of a particle is missing from the sum of all kernels at
+            its centre, None: none are. Disorder alone takes up to a half.
+    """
+
+    every: int = 20
+    closest: float | None = 0.4
+    heaviest: float = 2.5
+    missing: float | None = 0.75
+
+    def __post_init__(self) -> None:
+        if self.every < 1:
+            raise ValueError(f"PopulationControl.every must be at least 1 step, got {self.every}")
+        if self.closest is not None and not 0 < self.closest < 1:
+            raise ValueError(f"PopulationControl.closest must lie in (0, 1) spacings or be None, got {self.closest}")
+        if not self.heaviest > 0:
+            raise ValueError(f"PopulationControl.heaviest must be positive, got {self.heaviest}")
+        if self.missing is not None and not self.missing > 0:
+            raise ValueError(f"PopulationControl.missing must be positive or None, got {self.missing}")
+
+
+class Population:
+    """Controls the population of a run; internal units, all members at once."""
+
+    def __init__(
+        self, options: PopulationControl, domain: Domain, support: Support, backend: Backend, record: Record
+    ) -> None:
+        self.options, self.domain, self._support, self._backend = options, domain, support, backend
+        self._record = record
+        zero = torch.zeros(1, dtype=torch.float64)
+        self._peak = float(support.kernel.value(zero, support.length, support.dimension))
+        self._lower = self._upper = torch.zeros(support.dimension, dtype=domain.dtype, device=domain.device)
+        if domain.walls is not None:  # a particle that has got away must not make the grid of cells endless
+            ends = torch.as_tensor(domain.scene.walls.vertices_at_keys, dtype=domain.dtype, device=domain.device)
+            ends = ends.reshape(-1, support.dimension) / domain.units.length
+            self._lower, self._upper = torch.floor(ends.amin(0)) - 1.0, ends.amax(0) + 1.0
+
+    @classmethod
+    def of(
+        cls, domain: Domain, backend: Backend, record: Record, particles: Particles, time: float
+    ) -> Population | None:
+        """The control that the domain's scheme asks for, or None.
+
+        Raises ValueError where the particles do not fill what encloses them.
+        """
+        scheme = domain.scheme
+        if scheme.population is None:
+            return None
+        filling = float(domain.filling(particles, time).min()) if particles.count else 0.0
+        if filling < _LEAST_FILLING:
+            raise ValueError(
+                f"population control needs fluid that fills its walls or its box; it fills {100 * filling:.0f} %"
+            )
+        support = Support(kernel(scheme.kernel), scheme.smoothing_ratio, domain.scene.dimension)
+        return cls(scheme.population, domain, support, backend, record)
+
+    def controlled(self, particles: Particles, due: Tensor) -> tuple[Particles, bool]:
+        """Merge and seed in the members where ``due`` (members,) bool; True where that has changed the set."""
+        before = particles
+        if self.options.closest is not None:
+            particles = self._merged(particles, due)
+        if self.options.missing is not None:
+            particles = self._seeded(particles, due)
+        return particles, particles is not before
+
+    def _merged(self, particles: Particles, due: Tensor) -> Particles:
+        """Merge the pairs nearer than ``closest``: cells of twice that size, in every half-shifted arrangement."""
+        edge = 2.0 * self.options.closest
+        for shift in itertools.product((0.0, 0.5 * edge), repeat=particles.dimension):
+            row = torch.nonzero(particles.inside & due[particles.member]).squeeze(1)
+            place, cell, _ = self._cells(particles, row, edge, shift)
+            order = torch.argsort(cell, stable=True)
+            first, second = order[:-1], order[1:]
+            near = cell[first] == cell[second]
+            near &= square_length(place[first] - place[second]) < self.options.closest**2
+            near &= particles.mass[row[first]] + particles.mass[row[second]] < self.options.heaviest
+            # of three in a row the middle one can merge once only
+            near[1:] &= ~near[:-1]
+            first, second = row[first[near]], row[second[near]]
+            if first.numel():
+                particles = self._joined_pairs(particles, first, second)
+        return particles
+
+    def _joined_pairs(self, particles: Particles, first: Tensor, second: Tensor) -> Particles:
+        """Particles ``second`` (n,) gone into ``first`` (n,): masses added, all else their mean by mass."""
+        mass = particles.mass
+        total = mass[first] + mass[second]
+        part = mass[second] / total
+        changes = {"mass": mass.index_copy(0, first, total)}
+        for name in ("position", "velocity", "deviation", "pressure", "confidence"):
+            value = getattr(particles, name)
+            if value is None:
+                continue
+            way = value[second] - value[first]
+            if name == "position":
+                way = self.domain.shortest(way)
+            weight = part.reshape(-1, *[1] * (value.ndim - 1))
+            changes[name] = value.index_copy(0, first, value[first] + weight * way)
+        keep = torch.ones_like(particles.fluid).index_fill(0, second, False)
+        self._record.merged.index_add_(0, particles.member[second], torch.ones_like(second))
+        return particles.changed(**changes).select(keep)
+
+    def _cells(
+        self, particles: Particles, row: Tensor, edge: float, shift: tuple[float, ...]
+    ) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor, Tensor]]:
+        """Places (n, D) in a frame without seams, their cells (n,), and the cells' origin, edges and numbers (D,)."""
+        place = self.domain.wrapped(particles.position[row] + particles.position.new_tensor(shift))
+        origin, far, period = self._lower, self._upper, self.domain.period
+        size = torch.full_like(origin, edge)
+        if period is not None:
+            closed = torch.isfinite(period)
+            whole = torch.where(closed, period, size)
+            fitting = whole / torch.floor(whole / edge + 1e-3).clamp_min(1.0)
+            origin, size = torch.where(closed, 0.0 * origin, origin), torch.where(closed, fitting, size)
+            far = torch.where(closed, whole - 0.5 * size, far)
+        counts = torch.floor((far - origin) / size).to(torch.int64) + 1
+        index = torch.minimum(((place - origin) / size).to(torch.int64), counts - 1).clamp_min(0)
+        cell = particles.member[row]
+        for axis in range(particles.dimension):
+            cell = cell * counts[axis] + index[:, axis]
+        return place, cell, (origin, size, counts)
+
+    def _seeded(self, particles: Particles, due: Tensor) -> Particles:
+        """Seed the empty cells, one spacing wide, in whose middle the kernels' sum falls short."""
+        row = torch.nonzero(particles.inside).squeeze(1)
+        if not row.numel():
+            return particles
+        place, member = self._holes(particles, row, due)
+        if not place.shape[0]:
+            return particles
+        sought = torch.zeros_like(due).index_fill(0, member, True)
+        row = row[sought[particles.member[row]]]
+        donors = particles.select(row)
+        around = self._sums(donors, self._fields(donors), place, member)
+        enough = around.count > particles.dimension
+        if not bool(enough.all()):
+            place, member = place[enough], member[enough]
+            around = Moments(*(value[enough] for value in vars(around).values()))
+        if not place.shape[0]:
+            return particles
+        self._record.reseeded.index_add_(0, member, torch.ones_like(member))
+        return self._taken(particles, row, place, member, around)
+
+    def _holes(self, particles: Particles, row: Tensor, due: Tensor) -> tuple[Tensor, Tensor]:
+        """Places (n, D) where particles are missing, and their members (n,)."""
+        _, cell, (origin, size, counts) = self._cells(particles, row, 1.0, (0.0,) * particles.dimension)
+        total = int(counts.prod())
+        held = torch.zeros(particles.members * total, dtype=torch.bool, device=cell.device)
+        held[cell] = True
+        empty = ~held.reshape(particles.members, total) & due[:, None]
+        number = torch.nonzero(empty.any(0)).squeeze(1)
+        index, left = [], number
+        for axis in range(particles.dimension - 1, -1, -1):
+            index.insert(0, left % counts[axis])
+            left = left // counts[axis]
+        centre = origin + (torch.stack(index, 1).to(origin.dtype) + 0.5) * size
+        share = torch.ones_like(centre[:, 0])
+        fit = torch.ones_like(number, dtype=torch.bool)
+        if self.domain.walls is not None and number.numel():
+            wall = self.domain.sample_at(centre)
+            # without the kernel's share the sum means nothing where walls cut the kernel
+            clear = _CLEARANCE if wall.share is not None else self._support.radius
+            fit = (wall.distance > clear) & ~self.domain.beyond_valves(centre)
+            share = share if wall.share is None else wall.share
+        member, which = torch.nonzero(empty[:, number[fit]], as_tuple=True)
+        centre, share = centre[fit][which], share[fit][which]
+        if not member.numel():
+            return centre, member
+        covered = self._sums(particles, particles.mass[:, None], centre, member).value
+        hole = covered < share * (1.0 - self.options.missing * self._peak)
+        return centre[hole], member[hole]
+
+    def _sums(self, particles: Particles, fields: Tensor, place: Tensor, member: Tensor) -> Moments:
+        """Moments, weighted by mass, of ``fields`` (N, C) of particles at places (n, D) of members (n,)."""
+        return self._backend.interpolate(
+            particles.position,
+            particles.member,
+            fields,
+            self._support,
+            place,
+            member,
+            period=self.domain.period,
+            weight=particles.mass,
+        )
+
+    @staticmethod
+    def _fields(particles: Particles) -> Tensor:
+        """What new particles are given by interpolation, (N, C): mass, deviation, velocity, and what else there is."""
+        more = [value for value in (particles.pressure, particles.confidence) if value is not None]
+        return torch.stack([particles.mass, particles.deviation, *particles.velocity.unbind(1), *more], 1)
+
+    def _taken(self, particles: Particles, row: Tensor, place: Tensor, member: Tensor, around: Moments) -> Particles:
+        """Particles with new ones at ``place``, which those in ``row`` pay for in mass and momentum."""
+        dimension, total = particles.dimension, around.value
+        mean = around.field / total[:, None]
+        fitted = first_order_value(around.value, around.first, around.second, around.field, around.field_first)
+        offset = around.first.norm(dim=1) / total
+        inner = offset < _LARGEST_OFFSET * self._support.length
+        value = torch.where(inner[:, None], fitted, mean)
+        mass = mean[:, 0]  # of a particle like those around
+        # each neighbour gives the part (mass / total) W of its own mass, and the momentum that goes with it
+        part = mass / total
+        loss = self._received(particles, row, place, member, part[:, None])[:, 0]
+        most = torch.zeros(particles.members, dtype=loss.dtype, device=loss.device)
+        most = most.scatter_reduce(0, particles.member[row], loss, "amax")
+        scale = _LARGEST_GIFT / most.clamp_min(_LARGEST_GIFT)
+        mass, part = mass * scale[member], part * scale[member]
+        velocity, carried = value[:, 2 : 2 + dimension], mean[:, 2 : 2 + dimension]
+        back = (carried - velocity) * part[:, None]  # what the new ones do not take of it goes back
+        given = self._received(particles, row, place, member, torch.cat([part[:, None], back], 1))
+        kept = 1.0 - given[:, 0]
+        paid = particles.changed(
+            mass=particles.mass.index_copy(0, row, particles.mass[row] * kept),
+            velocity=particles.velocity.index_copy(0, row, particles.velocity[row] + given[:, 1:] / kept[:, None]),
+        )
+        rest = iter(value[:, 2 + dimension :].unbind(1))
+        return paid.joined(
+            Particles(
+                place,
+                velocity,
+                value[:, 1],
+                mass,
+                member,
+                torch.full_like(member, FLUID),
+                particles.members,
+                pressure=None if particles.pressure is None else next(rest),
+                confidence=None if particles.confidence is None else next(rest).clamp_min(0.0),
+            )
+        )
+
+    def _received(self, particles: Particles, row: Tensor, place: Tensor, member: Tensor, values: Tensor) -> Tensor:
+        """Sum over new places of W times ``values`` (n, C), at the particles in ``row``: (len(row), C)."""
+        return self._backend.interpolate(
+            place,
+            member,
+            values,
+            self._support,
+            particles.position[row],
+            particles.member[row],
+            period=self.domain.period,
+        ).field

@@ -1,0 +1,1 @@
+"""Options of the schemes and of their parts; imports nothing of the engine."""

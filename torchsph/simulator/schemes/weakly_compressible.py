@@ -1,0 +1,284 @@
+"""How a scene is stepped: the options of the weakly compressible scheme and its presets."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from torchsph.pairs.interface import CONTINUITY_FORMS, PRESSURE_FORMS
+from torchsph.pairs.smoothing_kernels import kernel
+
+from ..population import PopulationControl
+
+ORDERS = ("thesis", "symplectic", "verlet", "predictor_corrector")
+
+
+@dataclass(frozen=True)
+class XSPH:
+    """XSPH (2.33): neighbours' velocities pull with strength ``epsilon``.
+
+    ``level`` is "velocity" (2.34: the momentum itself is smoothed, as in the thesis; strongly dissipative) or
+    "position" (Monaghan 1989: only the motion of the particles). ``form`` is "pairs" (the full sum) or "centroid"
+    (thesis 5.2, the "poor man's XSPH": towards the mean velocities of the cells around, ``pairs.centroid``). Where the
+    pair sums are compiled the full sum is the cheaper one: a tenth of a step in space, against two more steps.
+    """
+
+    epsilon: float = 0.2
+    level: str = "velocity"
+    form: str = "pairs"
+
+    def __post_init__(self) -> None:
+        if not 0 < self.epsilon <= 1:
+            raise ValueError(f"XSPH epsilon must lie in (0, 1], got {self.epsilon}")
+        if self.level not in ("velocity", "position"):
+            raise ValueError(f"XSPH level must be 'velocity' or 'position', got '{self.level}'")
+        if self.form not in ("pairs", "centroid"):
+            raise ValueError(f"XSPH form must be 'pairs' or 'centroid', got '{self.form}'")
+
+
+@dataclass(frozen=True)
+class GammaRamp:
+    """The exponent gamma of (2.25) grows after a start or an imposition (thesis 5.2), so that noise meets a soft fluid.
+
+    Attributes:
+        start: gamma at the imposition; it grows linearly in time to the scheme's gamma.
+        duration: s, after which the scheme's gamma acts.
+        keep: what stays while gamma grows. "prefactor": B = rho0 c^2 / gamma, so that the fluid starts softer, with
+            the sound speed c sqrt(gamma(t) / gamma), and takes longer steps; "sound_speed": c, so that only the
+            curvature of p(rho) changes (at small density deviations, next to nothing).
+    """
+
+    start: float = 1.0
+    duration: float = 0.01
+    keep: str = "prefactor"
+
+    def __post_init__(self) -> None:
+        if not self.start > 0 or not self.duration > 0:
+            raise ValueError(f"GammaRamp needs positive start and duration (s), got {self.start}, {self.duration}")
+        if self.keep not in ("prefactor", "sound_speed"):
+            raise ValueError(f"GammaRamp.keep must be 'prefactor' or 'sound_speed', got '{self.keep}'")
+
+
+@dataclass(frozen=True)
+class Rollback:
+    """A member that fails goes back to its last good state and tries again with steps half as long.
+
+    The others wait meanwhile; a search of neighbours that its way back calls for may change them by round-off.
+
+    Attributes:
+        tries: how often from one state, each time with steps half as long again; then the member is frozen there.
+        every: steps between the states that are kept; one is kept at the start of each imposed interval as well.
+        density: range of rho / rho0; a member with a particle outside counts as failed, before it is not finite.
+    """
+
+    tries: int = 3
+    every: int = 50
+    density: tuple[float, float] = (0.5, 2.0)
+
+    def __post_init__(self) -> None:
+        if self.tries < 1 or self.every < 1:
+            raise ValueError(f"Rollback needs at least one try and one step, got {self.tries}, {self.every}")
+        if not 0 <= self.density[0] < 1 < self.density[1]:
+            raise ValueError(f"Rollback.density must be a range around 1, got {self.density}")
+
+
+@dataclass(frozen=True)
+class PotentialWall:
+    """The thesis's wall (3.1, 3.2): potential U(s) = stiffness c^2 s^2 / 2 with s = 1 - d / reach for d < reach.
+
+    Attributes:
+        stiffness: wall potential at d = 0 in units of c^2 / 2.
+        reach: distance at which the potential starts, in particle spacings.
+        relaxation: time constant tau of the no-slip retardation at the wall, in reach / c; None: free slip. The factor
+            per step is xi = 1 - exp(-dt / tau * s), applied to the tangential velocity relative to the wall.
+    """
+
+    stiffness: float = 0.2
+    reach: float = 1.0
+    relaxation: float | None = 1.0
+
+    def __post_init__(self) -> None:
+        if not self.stiffness > 0 or not self.reach > 0:
+            raise ValueError(f"PotentialWall needs positive stiffness and reach, got {self.stiffness}, {self.reach}")
+        if self.relaxation is not None and not self.relaxation > 0:
+            raise ValueError(f"PotentialWall.relaxation must be positive or None, got {self.relaxation}")
+
+
+@dataclass(frozen=True)
+class CompleteKernelWall:
+    """Wall by the analytic kernel integrals behind it (Ferrand et al. 2013): no wall particles, one look-up each.
+
+    Attributes:
+        no_slip: laminar friction with the wall (True) or free slip.
+        gap: particles are kept this far inside the wall, in particle spacings.
+        sliding: for walls that slide past others at an edge, as the lid of a cavity does. What they sweep is then
+            integrated over the surface; otherwise the nearest wall's velocity stands for all that a kernel sees, and
+            a lid would seem to push the side walls (3 % of density in the corners, and noise from there).
+    """
+
+    no_slip: bool = True
+    gap: float = 0.05
+    sliding: bool = False
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.gap < 0.5:
+            raise ValueError(f"CompleteKernelWall.gap must lie in [0, 0.5), got {self.gap}")
+
+
+@dataclass(frozen=True)
+class PressureSource:
+    """A timed pressure source at an open valve (3.3, 3.4), softened inside ``core``.
+
+    The strength Q follows from continuity: the acceleration that changes the flux through the orifice as the volume of
+    the cavity demands, spread over a half-sphere around the orifice. ``core`` is in orifice radii.
+    """
+
+    core: float = 0.5
+
+    def __post_init__(self) -> None:
+        if not self.core > 0:
+            raise ValueError(f"PressureSource.core must be positive, got {self.core}")
+
+
+@dataclass(frozen=True)
+class Reservoir:
+    """An open valve as an opening with a buffer of particles behind it whose flux follows from dV/dt.
+
+    Attributes:
+        profile: "field" (the velocity profile of the imposed field, flat where it has none) or "flat".
+        relaxation: time (spacings per reference speed) in which a difference between the particles' volume and the
+            cavity's is let through the open valve on top of dV/dt, or None.
+        run_out: length (spacings) of free channel between an outlet and its buffer, 0 or more than 1. A scheme that
+            projects needs as much as its kernel reaches: no pressure can bring a particle to the speed of a prescribed
+            one beside it.
+    """
+
+    profile: str = "field"
+    run_out: float = 0.0
+    relaxation: float | None = 5.0
+
+    def __post_init__(self) -> None:
+        if self.profile not in ("field", "flat"):
+            raise ValueError(f"Reservoir.profile must be 'field' or 'flat', got '{self.profile}'")
+        if self.run_out != 0 and not self.run_out > 1:
+            raise ValueError(f"Reservoir.run_out must be 0 or more than 1 spacing, got {self.run_out}")
+        if self.relaxation is not None and not self.relaxation > 0:
+            raise ValueError(f"Reservoir.relaxation must be positive or None, got {self.relaxation}")
+
+
+@dataclass(frozen=True)
+class WeaklyCompressible:
+    """Weakly compressible SPH with an equation of state; None switches a term off.
+
+    Attributes:
+        kernel: name of the smoothing kernel.
+        smoothing_ratio: smoothing length h over particle spacing.
+        sound_speed: numerical speed of sound, m/s.
+        gamma: exponent of the Tait equation (2.25). gamma_ramp: how it grows after an imposition, or None.
+        background_pressure: p0 / rho0 in units of c^2 (0: none).
+        hughes_graham: whether p of 2.25 is taken at max(rho, rho0) (Hughes & Graham 2010): a fluid that cannot pull.
+        continuity: "volume" or "mass" (2.19) form of the density rate.
+        pressure: form of the pressure force (``MomentumTerms``).
+        artificial_viscosity: alpha of 2.29, or None.
+        laminar_viscosity: whether the viscosity of the scene's fluid acts (Morris et al. 1997).
+        density_diffusion: delta of delta-SPH, or None. diffusion_form: "plain" (Molteni & Colagrossi 2009) or
+            "corrected" (Antuono et al. 2010: leaves a linear density alone, at two more passes a step).
+        xsph: velocity smoothing, or None.
+        shifting: strength of the particle shifting (Lind et al. 2012 with the speed of the particle), or None.
+        bulk_damping: coefficient of a pressure -b c h div v that damps sound, or None.
+        shepard_period: steps between filters of the density, or None. density_filter: "shepard" (2.20), or "mls", which
+            leaves a linear density alone (Colagrossi & Landrini 2003 eqs. 12-14).
+        wall: wall model for scenes with walls; valve: valve model for scenes with valves (None: stays shut).
+        shifting_speed: the speed in the shifting: "local" (the particle's own) or "largest" (of its member: also
+            stagnation points are evened out, which a vortex needs and a jet in a resting chamber does not).
+        shifting_surface: h times the crowding gradient above which a particle counts as one of a free surface and is
+            not shifted, or None: all are.
+        tensile: R of Monaghan's tensile correction (2000; 0.2 there, symmetric pressure form only), or None.
+        order: "thesis" steps as algorithm 1; "symplectic" evaluates both passes at one position (symplectic Euler);
+            "verlet" is the position Verlet scheme, "predictor_corrector" the symplectic predictor-corrector, both of
+            second order (module ``second_order``).
+        courant: fraction of the acoustic limit h / (c + v), of h^2/(8 nu) and of sqrt(h / |a|) / 2.
+        constant_volume: the fluid fills a volume that never changes (a periodic box, or walls without openings that
+            enclose the same volume all the time): its mean density is held, which wanders by percents otherwise.
+        step_floor: no step is cut below this fraction of the acoustic limit of the fluid at rest, or None: a single
+            runaway particle then cannot stall a run; the record counts the steps that the floor held up.
+        rollback: second chances for members that fail, or None: they are frozen at once.
+        steps_per_frame: at least so many steps between imposed frames, or None.
+        population: how particles that crowd are merged and holes seeded again, or None: neither.
+    """
+
+    kernel: str = "wendland_c2"
+    smoothing_ratio: float = 1.3
+    sound_speed: float = 5.0
+    gamma: float = 1.0
+    background_pressure: float = 0.0
+    hughes_graham: bool = False
+    continuity: str = "volume"
+    pressure: str = "switched"
+    artificial_viscosity: float | None = 0.02
+    laminar_viscosity: bool = True
+    density_diffusion: float | None = 0.1
+    diffusion_form: str = "plain"
+    xsph: XSPH | None = None
+    shifting: float | None = 0.5
+    shifting_speed: str = "local"
+    shifting_surface: float | None = None
+    tensile: float | None = None
+    bulk_damping: float | None = 0.3
+    shepard_period: int | None = None
+    density_filter: str = "shepard"
+    wall: PotentialWall | CompleteKernelWall = field(default_factory=CompleteKernelWall)
+    valve: PressureSource | Reservoir | None = field(default_factory=Reservoir)
+    order: str = "symplectic"
+    courant: float = 0.35
+    constant_volume: bool = False
+    step_floor: float | None = 0.02
+    rollback: Rollback | None = None
+    steps_per_frame: int | None = None
+    population: PopulationControl | None = None
+    gamma_ramp: GammaRamp | None = None
+
+    def __post_init__(self) -> None:
+        kernel(self.kernel)
+        for name in ("smoothing_ratio", "sound_speed", "gamma", "courant"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"WeaklyCompressible.{name} must be positive, got {getattr(self, name)}")
+        for name in ("artificial_viscosity", "density_diffusion", "shifting", "bulk_damping", "background_pressure"):
+            value = getattr(self, name)
+            if value is not None and not value >= 0:
+                raise ValueError(f"WeaklyCompressible.{name} must not be negative, got {value}")
+        for name, known in (
+            ("continuity", CONTINUITY_FORMS),
+            ("pressure", PRESSURE_FORMS),
+            ("order", ORDERS),
+            ("shifting_speed", ("local", "largest")),
+            ("diffusion_form", ("plain", "corrected")),
+            ("density_filter", ("shepard", "mls")),
+        ):
+            if getattr(self, name) not in known:
+                raise ValueError(f"WeaklyCompressible.{name} must be one of {known}, got '{getattr(self, name)}'")
+        for name in ("shepard_period", "steps_per_frame"):
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise ValueError(f"WeaklyCompressible.{name} must be at least 1 or None, got {value}")
+        if self.step_floor is not None and not 0 < self.step_floor < 1:
+            raise ValueError(f"WeaklyCompressible.step_floor must lie in (0, 1) or be None, got {self.step_floor}")
+        self._check_combinations()
+
+    def _check_combinations(self) -> None:
+        """Refuse options that would be accepted and then ignored."""
+        if self.tensile is not None and not (self.tensile > 0 and self.pressure == "symmetric"):
+            raise ValueError(
+                "WeaklyCompressible.tensile must be positive and needs pressure='symmetric', got "
+                f"{self.tensile} with '{self.pressure}'"
+            )
+        if self.xsph is not None and self.xsph.level == "velocity" and self.order != "thesis":
+            raise ValueError(
+                f"XSPH of level 'velocity' belongs to order 'thesis', got order '{self.order}'; use level 'position'"
+            )
+        if self.shifting_surface is not None and not (self.shifting_surface > 0 and self.shifting is not None):
+            raise ValueError(
+                "WeaklyCompressible.shifting_surface must be positive and needs shifting, got "
+                f"{self.shifting_surface} with shifting {self.shifting}"
+            )
+        if self.shepard_period is not None and self.order not in ("thesis", "symplectic"):
+            raise ValueError(f"the Shepard filter needs order 'thesis' or 'symplectic', got '{self.order}'")

@@ -1,0 +1,64 @@
+"""The simulator: a scene and a scheme make running batches of members that advance together."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+
+from torchsph.pairs import backend as choose_backend
+
+from .domain import Domain
+from .scene import Scene
+from .schemes.presets import Scheme, preset
+from .seeding import Seeding, seed_particles
+from .simulation import Simulation
+from .state.particles import Particles
+from .state.units import Units
+
+
+@dataclass(frozen=True)
+class Simulator:
+    """A scene with the way to step it.
+
+    Args:
+        scene: fluid, walls, valves, forces (SI).
+        scheme: ``Projection`` or ``WeaklyCompressible`` options; None: the weakly compressible preset, for any scene.
+        device, dtype: where and in what precision particles live (float32 or float64).
+        backend: name of the pair backend, or "auto" for the best one present.
+        seeding: how particles are placed; None takes what the scheme's walls call for.
+    """
+
+    scene: Scene
+    scheme: Scheme | None = None
+    device: str = "cpu"
+    dtype: torch.dtype = torch.float32
+    backend: str = "auto"
+    seeding: Seeding | None = None
+
+    def __post_init__(self) -> None:
+        if self.scheme is None:
+            object.__setattr__(self, "scheme", preset("weakly_compressible"))
+        if self.dtype not in (torch.float32, torch.float64):
+            raise ValueError(f"Simulator.dtype must be torch.float32 or torch.float64, got {self.dtype}")
+        choose_backend(self.backend, self.device)  # a missing backend must not surface in the middle of a run
+        units = Units(self.scene.spacing, self.scene.reference_speed)
+        domain = Domain(self.scene, self.scheme, units, self.device, self.dtype)
+        object.__setattr__(self, "_domain", domain)
+
+    @property
+    def domain(self) -> Domain:
+        """Walls, valves and forces as particles see them; shared by all runs."""
+        return self._domain
+
+    def start(self, time: float, *, members: int = 1, seed: int = 0) -> Simulation:
+        """A resting fluid at ``time`` (s): ``members`` copies of one seeding, drawn with ``seed``."""
+        if members < 1:
+            raise ValueError(f"a simulation needs at least one member, got {members}")
+        generator = torch.Generator(device=self.device).manual_seed(seed)
+        one = seed_particles(self, time, generator)
+        return self.resume(one.repeated(members), time)
+
+    def resume(self, particles: Particles, time: float) -> Simulation:
+        """Run on with particles in internal units that were made elsewhere."""
+        return Simulation(self, particles, time)

@@ -1,0 +1,1 @@
+"""One time step: its sums, its order, its length."""

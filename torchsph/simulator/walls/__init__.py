@@ -1,0 +1,1 @@
+"""What particles see of walls."""

@@ -1,0 +1,1 @@
+"""From echoes to velocities; knows no simulated scanner."""

@@ -1,0 +1,1 @@
+"""A simulated scanner: scatterers in a flow become echoes."""

@@ -1,0 +1,1 @@
+"""Flows with known answers, for tests and benchmarks."""
