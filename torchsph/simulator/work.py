@@ -13,14 +13,13 @@ from torch import Tensor
 
 from torchsph.pairs.interface import inner, per_particle, square_length
 
-from .schemes.wall_models import CompleteKernelWall, PotentialWall
-from .state.energy import energy_unit
+from .domain import Domain
+from .schemes.wall_models import PotentialWall
 from .state.particles import Particles
 from .state.record import Record
 from .walls.forces import WallSample, friction_rate, potential_force, retardation
 
 if TYPE_CHECKING:
-    from .domain import Domain
     from .stepping.projection import ProjectionStepper
     from .stepping.weakly_compressible import Stepper
 
@@ -37,16 +36,14 @@ class WorkAccount:
 
     def __init__(self, domain: Domain, record: Record) -> None:
         self._record, self._wall = record, domain.scheme.wall
-        self._friction = isinstance(self._wall, CompleteKernelWall) and self._wall.no_slip
-        self._sources = domain.sources
-        self._moving = domain.walls is not None and bool(domain.scene.walls.rates_at_keys.any())
-        self._unit = energy_unit(domain.units, domain.scene.fluid.density, domain.scene.dimension)
+        self._moving = domain.walls is not None and bool(domain.walls.motion.rates_at_keys.any())
+        self._unit = domain.energy_unit
 
     @classmethod
     def of(cls, domain: Domain, record: Record) -> WorkAccount | None:
         """The account of a scene; None where nothing can do work, so that it costs nothing."""
         account = cls(domain, record)
-        return account if account._moving or account._sources is not None else None
+        return account if account._moving or domain.valves.does_work else None
 
     def note(
         self,
@@ -56,18 +53,23 @@ class WorkAccount:
         step: Tensor,
         stepper: Stepper | ProjectionStepper,
         counts: Tensor,
+        by_valves: Tensor | None,
     ) -> None:
         """Account for one step.
 
         Args:
             before, stepped: the particles before the step and after it, not yet stopped by walls.
-            wall: what they saw. step: (members,), internal. counts: (members,) bool, whose steps were taken.
+            wall: what they saw.
+            step: (members,), internal.
+            stepper: what knows pressure and coefficients.
+            counts: (members,) bool, whose steps were taken.
+            by_valves: (N, D), acceleration by pressure sources, or None.
         """
         if self._moving and wall is not None:
             power = self._power_of_walls(before, stepped, wall, step, stepper) * stepped.mass * stepped.inside
             self._add("wall_work", stepped.per_member(power, "sum"), step, counts)
-        if self._sources is not None and self._sources.push is not None:
-            power = 0.5 * before.mass * (self._sources.push * (before.velocity + stepped.velocity)).sum(1)
+        if by_valves is not None:
+            power = 0.5 * before.mass * (by_valves * (before.velocity + stepped.velocity)).sum(1)
             self._add("source_work", before.per_member(power.double(), "sum"), step, counts)
 
     def _add(self, name: str, power: Tensor, step: Tensor, counts: Tensor) -> None:
@@ -96,7 +98,7 @@ class WorkAccount:
             return inner(force, wall.velocity)
         swept = inner(wall.velocity, wall.share_gradient) if wall.swept is None else wall.swept
         power = 2.0 * stepper.pressure(stepped) / (1.0 + stepped.deviation) * swept
-        if self._friction and c.viscosity is not None:
+        if self._wall.no_slip and c.viscosity is not None:
             rate = friction_rate(per_particle(c.viscosity, stepped.member), wall)
             power = power + rate * (square_length(wall.velocity) - inner(before.velocity, wall.velocity))
         return power
