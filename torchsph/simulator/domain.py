@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from geometry import Grid
-from torchsph.pairs.interface import per_particle
 from torchsph.pairs.smoothing_kernels import kernel
+from torchsph.pairs.vectors import per_particle
 
 from .imposing import fill_beyond
 from .scene import Scene

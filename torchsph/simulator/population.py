@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from torchsph.pairs.interface import Backend, Moments, Support, square_length
+from torchsph.pairs.interface import Backend, Moments, Support
 from torchsph.pairs.smoothing_kernels import kernel
+from torchsph.pairs.vectors import square_length
 
 from .imposing import first_order_value
 from .state.particles import FLUID, Particles

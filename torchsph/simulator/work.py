@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from torchsph.pairs.interface import inner, per_particle, square_length
+from torchsph.pairs.vectors import inner, per_particle, square_length
 
 from .schemes.weakly_compressible import CompleteKernelWall, PotentialWall
 from .state.particles import Particles

@@ -10,8 +10,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchsph.pairs.interface import MomentumTerms, Rates, RateTerms, Support, inner, square_length
+from torchsph.pairs.interface import MomentumTerms, Rates, RateTerms, Support
 from torchsph.pairs.poisson import PoissonSolution
+from torchsph.pairs.vectors import inner, square_length
 
 from ..state.neighbour_list import PairSearch
 from ..state.particles import Particles

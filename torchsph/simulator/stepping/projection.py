@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from torchsph.pairs.interface import MomentumTerms, Rates, RateTerms, Support, inner, per_particle
+from torchsph.pairs.interface import MomentumTerms, Rates, RateTerms, Support
 from torchsph.pairs.poisson import PoissonSolution
 from torchsph.pairs.smoothing_kernels import kernel
+from torchsph.pairs.vectors import inner, per_particle
 
 from ..schemes.projection import Projection
 from ..state.neighbour_list import PairSearch

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchsph.pairs.interface import square_length
+from torchsph.pairs.vectors import square_length
 
 from ..state.particles import Particles
 from ..state.record import Record

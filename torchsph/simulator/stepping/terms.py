@@ -6,8 +6,9 @@ import torch
 from torch import Tensor
 
 from torchsph.pairs.backends.reference import SINGULARITY
-from torchsph.pairs.interface import Rates, per_particle, square_length
+from torchsph.pairs.interface import Rates
 from torchsph.pairs.smoothing_kernels import SmoothingKernel
+from torchsph.pairs.vectors import per_particle, square_length
 
 from ..imposing import solve_small
 from ..state.particles import Particles

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from torch import Tensor
 
-from torchsph.pairs.interface import per_particle
+from torchsph.pairs.vectors import per_particle
 
 from ..state.particles import Particles
 from ..walls.forces import WallSample

@@ -8,8 +8,9 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
-from torchsph.pairs.interface import MomentumTerms, Rates, RateTerms, Support, per_particle
+from torchsph.pairs.interface import MomentumTerms, Rates, RateTerms, Support
 from torchsph.pairs.smoothing_kernels import kernel
+from torchsph.pairs.vectors import per_particle
 
 from ..imposing import solve_small
 from ..schemes.weakly_compressible import CompleteKernelWall, PotentialWall, WeaklyCompressible

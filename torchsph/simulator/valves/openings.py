@@ -8,7 +8,7 @@ from torch import Tensor
 
 from geometry import OrificePlane
 from geometry.motion.orifices import rim_distance
-from torchsph.pairs.interface import square_length
+from torchsph.pairs.vectors import square_length
 
 # half the width (spacings) over which what stands over an opening is blended in
 _RIM = 0.5

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 import geometry
-from torchsph.pairs.interface import per_particle
+from torchsph.pairs.vectors import per_particle
 
 from ..scene import Scene
 from ..schemes.weakly_compressible import PressureSource

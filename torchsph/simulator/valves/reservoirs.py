@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from geometry import orifices
-from torchsph.pairs.interface import per_particle
+from torchsph.pairs.vectors import per_particle
 
 from ..state.particles import CHANNEL, FLUID, RESERVOIR, Particles
 from ..state.record import Record
