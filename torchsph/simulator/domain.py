@@ -14,7 +14,9 @@ from torchsph.pairs.vectors import per_particle
 from .imposing import fill_beyond
 from .scene import Scene
 from .schemes.presets import Scheme
-from .schemes.weakly_compressible import CompleteKernelWall, PressureSource, Reservoir
+from .schemes.valve_models import PressureSource, Reservoir
+from .schemes.wall_models import CompleteKernelWall
+from .state.energy import energy_unit
 from .state.particles import Particles
 from .state.record import Record
 from .state.units import Units
@@ -22,7 +24,6 @@ from .walls.compiled import near_wall
 from .walls.fields import WallFields
 from .walls.forces import WallSample
 from .walls.look_up import LookUp
-from .work import energy_unit
 
 # a particle this far beyond a wall (spacings) counts as outside; the soft potential is meant to be entered a little
 _OUTSIDE = 0.5

@@ -7,17 +7,17 @@ from the particles around it.  What flows through valves is left to the reservoi
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from torchsph.pairs.interface import Backend, Moments, Support
+from torchsph.pairs.moving_least_squares import first_order_value
 from torchsph.pairs.smoothing_kernels import kernel
 from torchsph.pairs.vectors import square_length
 
-from .imposing import first_order_value
+from .schemes.population_control import PopulationControl
 from .state.particles import FLUID, Particles
 from .state.record import Record
 
@@ -32,34 +32,6 @@ _CLEARANCE = 0.3
 _LARGEST_GIFT = 0.4
 # offset of the neighbours' centre of mass (smoothing lengths) beyond which a fit would extrapolate
 _LARGEST_OFFSET = 0.5
-
-
-@dataclass(frozen=True)
-class PopulationControl:
-    """When particles are merged and seeded.
-
-    Attributes:
-        every: steps between one look and the next.
-        closest: particles nearer to each other than this (spacings) are merged, None: none are.
-        heaviest: but not to more than this mass, in those of a cubic spacing of fluid.
-        missing: an empty cell is seeded where at least so much of a particle is missing from the sum of all kernels at
-            its centre, None: none are. Disorder alone takes up to a half.
-    """
-
-    every: int = 20
-    closest: float | None = 0.4
-    heaviest: float = 2.5
-    missing: float | None = 0.75
-
-    def __post_init__(self) -> None:
-        if self.every < 1:
-            raise ValueError(f"PopulationControl.every must be at least 1 step, got {self.every}")
-        if self.closest is not None and not 0 < self.closest < 1:
-            raise ValueError(f"PopulationControl.closest must lie in (0, 1) spacings or be None, got {self.closest}")
-        if not self.heaviest > 0:
-            raise ValueError(f"PopulationControl.heaviest must be positive, got {self.heaviest}")
-        if self.missing is not None and not self.missing > 0:
-            raise ValueError(f"PopulationControl.missing must be positive or None, got {self.missing}")
 
 
 class Population:

@@ -14,7 +14,7 @@ from torchsph.pairs import backend as choose_backend
 from torchsph.pairs.interface import PairState, RateTerms, Support
 from torchsph.pairs.smoothing_kernels import kernel
 
-from .schemes.weakly_compressible import CompleteKernelWall, PotentialWall
+from .schemes.wall_models import CompleteKernelWall, PotentialWall
 from .state.neighbour_list import PairSearch
 from .state.particles import FLUID, Particles
 from .stepping.pressure import Neighbourhood, packing

@@ -12,24 +12,26 @@ from torch import Tensor
 
 from geometry import Grid
 from torchsph.pairs import backend as choose_backend
+from torchsph.pairs.moving_least_squares import Fetched, fetch_at
 
-from .imposing import Fetched, fetch_at, pulled
+from .imposing import pulled
 from .population import Population
 from .rollback import Checkpoints
 from .schemes.projection import Projection
-from .schemes.weakly_compressible import CompleteKernelWall
+from .schemes.wall_models import CompleteKernelWall
 from .state.neighbour_list import PairSearch
 from .state.particles import Particles, held, held_rows
 from .state.record import Record
 from .stepping.coefficients import Coefficients, Parameters
 from .stepping.pressure import Neighbourhood, divergence_free
-from .stepping.projection import ProjectionStepper, check_filled
+from .stepping.projection import ProjectionStepper
 from .stepping.step_length import StepControl
 from .stepping.weakly_compressible import Stepper
 from .valves.pressure_reservoirs import PressureValves
 from .work import WorkAccount
 
 if TYPE_CHECKING:
+    from .domain import Domain
     from .simulator import Simulator
 
 # how far particles move before the neighbours are searched again, in spacings
@@ -40,6 +42,22 @@ _SORT_FROM, _SORT_EVERY = 50_000, 8
 _MOST_STEPS = 1e7
 # support radius of the fetching weight, in spacings
 FETCH_RADIUS = 2.0
+
+
+# particles that fill less of their walls leave a free surface
+_LEAST_FILLING = 0.9
+
+
+def check_filled(scheme: Projection, domain: Domain, particles: Particles, time: float) -> None:
+    """ValueError where fluid does not fill its walls, or its box, though the scheme knows of no free surface."""
+    if scheme.surface is not None or particles.count == 0:
+        return
+    filling = float(domain.filling(particles, time).min())
+    if filling < _LEAST_FILLING:
+        raise ValueError(
+            f"the particles fill {100 * filling:.0f} % of what encloses them, so the fluid has a free surface: give "
+            "Projection(surface=0.85), or step with the weakly compressible scheme"
+        )
 
 
 class NumericalFailure(RuntimeError):

@@ -13,27 +13,16 @@ from torch import Tensor
 
 from torchsph.pairs.vectors import inner, per_particle, square_length
 
-from .schemes.weakly_compressible import CompleteKernelWall, PotentialWall
+from .schemes.wall_models import CompleteKernelWall, PotentialWall
+from .state.energy import energy_unit
 from .state.particles import Particles
 from .state.record import Record
-from .state.units import Units
 from .walls.forces import WallSample, friction_rate, potential_force, retardation
 
 if TYPE_CHECKING:
     from .domain import Domain
     from .stepping.projection import ProjectionStepper
     from .stepping.weakly_compressible import Stepper
-
-
-def energy_unit(units: Units, density: float, dimension: int) -> float:
-    """J (in a plane J/m) per internal energy, which counts masses in those of a spacing^D of fluid at rest density."""
-    return density * units.length**dimension * units.speed**2
-
-
-def carried_energy(particles: Particles, pressure: Tensor) -> Tensor:
-    """What particles carry through an opening: kinetic energy and the work p V of the pressure (N,), internal."""
-    per_mass = 0.5 * square_length(particles.velocity) + pressure / (1.0 + particles.deviation)
-    return (particles.mass * per_mass).double()
 
 
 class WorkAccount:

@@ -11,7 +11,7 @@ from scipy.special import eval_legendre
 import geometry
 from torchsph.simulator.scene import Fluid, Scene, Valve
 from torchsph.simulator.schemes.presets import Scheme, preset
-from torchsph.simulator.schemes.weakly_compressible import CompleteKernelWall
+from torchsph.simulator.schemes.wall_models import CompleteKernelWall
 from torchsph.simulator.simulation import Simulation
 from torchsph.simulator.simulator import Simulator
 

@@ -11,8 +11,8 @@ from torchsph import NumericalFailure, Projection, Scene, Simulator, WeaklyCompr
 from torchsph.pairs.interface import RateTerms
 from torchsph.simulator.scene import Fluid
 from torchsph.simulator.state.particles import Particles
+from torchsph.simulator.state.record import LIMITS
 from torchsph.simulator.stepping.pressure import Neighbourhood
-from torchsph.simulator.stepping.terms import LIMITS
 
 SIDE = 24
 SCHEME = Projection()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -23,24 +22,6 @@ from .coefficients import Coefficients
 from .pressure import Neighbourhood
 from .terms import shifting_displacement, softened_share
 from .weakly_compressible import Surroundings
-
-if TYPE_CHECKING:
-    from ..domain import Domain
-
-# particles that fill less of their walls leave a free surface
-_LEAST_FILLING = 0.9
-
-
-def check_filled(scheme: Projection, domain: Domain, particles: Particles, time: float) -> None:
-    """ValueError where fluid does not fill its walls, or its box, though the scheme knows of no free surface."""
-    if scheme.surface is not None or particles.count == 0:
-        return
-    filling = float(domain.filling(particles, time).min())
-    if filling < _LEAST_FILLING:
-        raise ValueError(
-            f"the particles fill {100 * filling:.0f} % of what encloses them, so the fluid has a free surface: give "
-            "Projection(surface=0.85), or step with the weakly compressible scheme"
-        )
 
 
 class ProjectionStepper:

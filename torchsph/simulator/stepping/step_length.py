@@ -8,9 +8,9 @@ from torch import Tensor
 from torchsph.pairs.vectors import square_length
 
 from ..state.particles import Particles
-from ..state.record import Record
+from ..state.record import LIMITS, Record
 from .coefficients import Coefficients
-from .terms import LIMITS, step_limits
+from .terms import step_limits
 
 
 class StepControl:

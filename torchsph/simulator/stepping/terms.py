@@ -7,14 +7,11 @@ from torch import Tensor
 
 from torchsph.pairs.backends.reference import SINGULARITY
 from torchsph.pairs.interface import Rates
+from torchsph.pairs.moving_least_squares import solve_small
 from torchsph.pairs.smoothing_kernels import SmoothingKernel
 from torchsph.pairs.vectors import per_particle, square_length
 
-from ..imposing import solve_small
 from ..state.particles import Particles
-
-# names of the time-step limits, in the order of ``step_limits``
-LIMITS = ("acoustic", "viscous", "force", "frame", "end of interval")
 
 
 def tait_pressure(deviation: Tensor, sound_speed: float | Tensor, gamma: float | Tensor) -> Tensor:

@@ -9,11 +9,12 @@ import torch
 from torch import Tensor
 
 from torchsph.pairs.interface import MomentumTerms, Rates, RateTerms, Support
+from torchsph.pairs.moving_least_squares import solve_small
 from torchsph.pairs.smoothing_kernels import kernel
 from torchsph.pairs.vectors import per_particle
 
-from ..imposing import solve_small
-from ..schemes.weakly_compressible import CompleteKernelWall, PotentialWall, WeaklyCompressible
+from ..schemes.wall_models import CompleteKernelWall, PotentialWall
+from ..schemes.weakly_compressible import WeaklyCompressible
 from ..state.neighbour_list import PairSearch
 from ..state.particles import Particles
 from ..walls.compiled import complete_forces, complete_rates

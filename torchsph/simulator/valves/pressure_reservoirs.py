@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 from torchsph.pairs.interface import Backend
+from torchsph.pairs.moving_least_squares import fetch_at
 
-from ..imposing import fetch_at
 from ..scene import Valve
 from ..state.particles import RESERVOIR, Particles
 from .openings import Frame

@@ -13,11 +13,11 @@ import geometry
 from torchsph.pairs.vectors import per_particle
 
 from ..scene import Scene
-from ..schemes.weakly_compressible import PressureSource
+from ..schemes.valve_models import PressureSource
+from ..state.energy import carried_energy, energy_unit
 from ..state.particles import Particles
 from ..state.record import Record
 from ..state.units import Units
-from ..work import carried_energy, energy_unit
 
 
 class Sources:

@@ -20,9 +20,9 @@ from torch import Tensor
 from geometry import orifices
 from torchsph.pairs.vectors import per_particle
 
+from ..state.energy import carried_energy, energy_unit
 from ..state.particles import CHANNEL, FLUID, RESERVOIR, Particles
 from ..state.record import Record
-from ..work import carried_energy, energy_unit
 from .openings import Frame
 
 if TYPE_CHECKING:

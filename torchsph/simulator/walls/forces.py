@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchsph.pairs.vectors import square_length
 
-from ..schemes.weakly_compressible import PotentialWall
+from ..schemes.wall_models import PotentialWall
 
 # the velocity gradient at the wall is taken over at least this distance (spacings): closer particles would be braked
 # faster than the viscous time step resolves. Many stand within 0.3 of the wall: 0.3 here lets a pipe flow slip by 0.5 %

@@ -6,7 +6,7 @@ import torch
 
 import geometry
 from torchsph.pairs.smoothing_kernels import kernel
-from torchsph.simulator.schemes.weakly_compressible import CompleteKernelWall, PotentialWall
+from torchsph.simulator.schemes.wall_models import CompleteKernelWall, PotentialWall
 from torchsph.simulator.walls import closest as wall_closest
 from torchsph.simulator.walls.fields import WallFields
 from torchsph.simulator.walls.forces import WallSample, potential, potential_force, retardation
