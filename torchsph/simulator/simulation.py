@@ -24,9 +24,8 @@ from .state.particles import Particles, held, held_rows
 from .state.record import Record
 from .stepping.coefficients import Coefficients, Parameters
 from .stepping.pressure import Neighbourhood, divergence_free
-from .stepping.projection import ProjectionStepper
 from .stepping.step_length import StepControl
-from .stepping.weakly_compressible import Stepper
+from .stepping.stepper import make_stepper
 from .valves.pressure_reservoirs import PressureValves
 from .work import WorkAccount
 
@@ -88,15 +87,15 @@ class Simulation:
         buffered = self.domain.reservoirs is not None
         if isinstance(scheme, Projection):
             check_filled(scheme, self.domain, particles, self.time)
-            self._stepper = ProjectionStepper(scheme, self._coefficients, search, scene.dimension, self.record)
-        else:
-            self._stepper = Stepper(scheme, self._coefficients, search, scene.dimension, buffered=buffered)
+        self._stepper = make_stepper(
+            scheme, self._coefficients, search, scene.dimension, self.record, buffered=buffered
+        )
         self._control = StepControl(self.record, scheme.step_floor)
         self._work = WorkAccount.of(self.domain, self.record)
         self._population = Population.of(self.domain, self._backend, self.record, particles, self.time)
         self._pressures = PressureValves.of(self.domain, self._backend)
         if self._pressures is not None:
-            self._stepper.held_kinds = self._pressures.kinds
+            self._stepper.prescribed_kinds = self._pressures.kinds
         self._acceleration = torch.zeros_like(particles.position)
         self._began_at = self._imposed_at = self.time
         self._order: Tensor | None = None  # of the particles in space when they were last sorted
@@ -372,7 +371,7 @@ class Simulation:
         search = self._stepper.pair_search
         here = Neighbourhood(self.particles, search, search.at(self.particles), self._stepper.support, wall)
         before = self.particles
-        self.particles = before.changed(velocity=divergence_free(here, times=times)[0])
+        self.particles = before.changed(velocity=divergence_free(here, times=times))
         mass = torch.where(before.fluid, before.mass, torch.zeros_like(before.mass)).double()
         taken, left = (
             before.per_member(mass * velocity.double().square().sum(1), "sum")

@@ -21,8 +21,7 @@ from .walls.forces import WallSample, friction_rate, potential_force, retardatio
 
 if TYPE_CHECKING:
     from .domain import Domain
-    from .stepping.projection import ProjectionStepper
-    from .stepping.weakly_compressible import Stepper
+    from .stepping.protocols import Stepper
 
 
 class WorkAccount:
@@ -54,7 +53,7 @@ class WorkAccount:
         stepped: Particles,
         wall: WallSample | None,
         step: Tensor,
-        stepper: Stepper | ProjectionStepper,
+        stepper: Stepper,
         counts: Tensor,
     ) -> None:
         """Account for one step.
@@ -81,7 +80,7 @@ class WorkAccount:
         stepped: Particles,
         wall: WallSample,
         step: Tensor,
-        stepper: Stepper | ProjectionStepper,
+        stepper: Stepper,
     ) -> Tensor:
         """Power per mass (N,) of the walls on the particles, internal; few passes, because every step pays for them."""
         c = stepper.coefficients

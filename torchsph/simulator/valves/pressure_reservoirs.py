@@ -20,8 +20,7 @@ from .openings import Frame
 
 if TYPE_CHECKING:
     from ..domain import Domain
-    from ..stepping.projection import ProjectionStepper
-    from ..stepping.weakly_compressible import Stepper
+    from ..stepping.protocols import Stepper
 
 # depth (spacings) inside an opening at which the pressure is read, and the velocity of fluid that enters (new particles
 # are noisy); that of fluid that leaves is read in the opening itself, where it may still gather speed. Support of the
@@ -50,7 +49,7 @@ class PressureValves:
             return None
         return cls(domain, backend)
 
-    def driven(self, particles: Particles, stepper: Stepper | ProjectionStepper) -> Particles:
+    def driven(self, particles: Particles, stepper: Stepper) -> Particles:
         """Give the buffers the pressure of the present time, and the velocity of the fluid before them."""
         active = [(n, frame) for n, frame in self._reservoirs.active() if n in self._reservoirs.given]
         given = self._given([n for n, _ in active], particles.members)
@@ -85,9 +84,7 @@ class PressureValves:
         table = torch.tensor(rows, dtype=torch.float64, device=self.domain.device) / self._unit
         return list((table - table.mean(0)) * self.domain.valve_strength)
 
-    def _followed(
-        self, particles: Particles, row: Tensor, frame: Frame, stepper: Stepper | ProjectionStepper
-    ) -> tuple[Tensor, Tensor]:
+    def _followed(self, particles: Particles, row: Tensor, frame: Frame, stepper: Stepper) -> tuple[Tensor, Tensor]:
         """What a buffer's particles in ``row`` find inside the opening: velocity (n, D) and p / rho0 (n,).
 
         The velocity is the opening's own, and the fluid's along the normal.
