@@ -12,9 +12,10 @@ import torch
 from torch import Tensor
 
 from torchsph.pairs.cell_search import nearest_image
-from torchsph.pairs.interface import Backend, Moments, Support, square_length
+from torchsph.pairs.interface import Backend, Moments, Support
 from torchsph.pairs.moving_least_squares import first_order_value
 from torchsph.pairs.smoothing_kernels import kernel
+from torchsph.pairs.vectors import square_length
 
 from .schemes.population_control import PopulationControl
 from .state.particles import FLUID, Particles

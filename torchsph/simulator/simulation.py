@@ -26,9 +26,8 @@ from .state.particles import Particles, held, held_rows
 from .state.record import Record
 from .stepping.coefficients import Coefficients, Parameters
 from .stepping.pressure import Neighbourhood, divergence_free
-from .stepping.projection import ProjectionStepper
 from .stepping.step_length import StepControl
-from .stepping.weakly_compressible import Stepper
+from .stepping.stepper import make_stepper
 from .surroundings import PresentSurroundings
 from .work import WorkAccount
 
@@ -113,17 +112,16 @@ class Simulation:
         search = PairSearch(self._backend, self.domain.support_radius, margin, self.domain.period)
         if isinstance(scheme, Projection):
             check_filled(scheme, domain, particles, self.time)
-            self._stepper = ProjectionStepper(scheme, self._coefficients, search, scene.dimension, self.record)
-        else:
-            self._stepper = Stepper(
-                scheme, self._coefficients, search, scene.dimension, buffered=domain.valves.has_buffers
-            )
+        buffered = domain.valves.has_buffers
+        self._stepper = make_stepper(
+            scheme, self._coefficients, search, scene.dimension, self.record, buffered=buffered
+        )
         self._control = StepControl(self.record, scheme.step_floor)
         self._work = WorkAccount.of(domain, self.record)
         self._population = Population.of(self.surroundings, self._backend, self.record, particles, self.time)
         self._pressures = domain.valves.pressure_reservoirs(self._backend)
         if self._pressures is not None:
-            self._stepper.held_kinds = self._pressures.kinds
+            self._stepper.prescribed_kinds = self._pressures.kinds
         self._acceleration = torch.zeros_like(particles.position)
         self._began_at = self._imposed_at = self.time
         self._order: Tensor | None = None  # of the particles in space when they were last sorted
@@ -399,7 +397,7 @@ class Simulation:
         search = self._stepper.pair_search
         here = Neighbourhood(self.particles, search, search.at(self.particles), self._stepper.support, wall)
         before = self.particles
-        self.particles = before.changed(velocity=divergence_free(here, times=times)[0])
+        self.particles = before.changed(velocity=divergence_free(here, times=times))
         mass = torch.where(before.fluid, before.mass, torch.zeros_like(before.mass)).double()
         taken, left = (
             before.per_member(mass * velocity.double().square().sum(1), "sum")

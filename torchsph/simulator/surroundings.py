@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from geometry import Grid
-from torchsph.pairs.interface import per_particle
+from torchsph.pairs.vectors import per_particle
 
 from .domain import Domain
 from .imposing import fill_beyond

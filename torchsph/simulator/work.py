@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from torchsph.pairs.interface import inner, per_particle, square_length
+from torchsph.pairs.vectors import inner, per_particle, square_length
 
 from .domain import Domain
 from .schemes.wall_models import PotentialWall
@@ -20,8 +20,7 @@ from .state.record import Record
 from .walls.forces import WallSample, friction_rate, potential_force, retardation
 
 if TYPE_CHECKING:
-    from .stepping.projection import ProjectionStepper
-    from .stepping.weakly_compressible import Stepper
+    from .stepping.protocols import Stepper
 
 
 class WorkAccount:
@@ -51,7 +50,7 @@ class WorkAccount:
         stepped: Particles,
         wall: WallSample | None,
         step: Tensor,
-        stepper: Stepper | ProjectionStepper,
+        stepper: Stepper,
         counts: Tensor,
         by_valves: Tensor | None,
     ) -> None:
@@ -83,7 +82,7 @@ class WorkAccount:
         stepped: Particles,
         wall: WallSample,
         step: Tensor,
-        stepper: Stepper | ProjectionStepper,
+        stepper: Stepper,
     ) -> Tensor:
         """Power per mass (N,) of the walls on the particles, internal; few passes, because every step pays for them."""
         c = stepper.coefficients

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from torchsph.pairs.interface import square_length
+from torchsph.pairs.vectors import square_length
 
 from .particles import Particles
 from .units import Units

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from geometry import OrificePlane, orifices
 from geometry.motion.orifices import rim_distance
-from torchsph.pairs.interface import square_length
+from torchsph.pairs.vectors import square_length
 
 from ..scene import Scene, Valve
 from ..state.clock import Clock

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 import geometry
-from torchsph.pairs.interface import per_particle
+from torchsph.pairs.vectors import per_particle
 
 from ..schemes.valve_models import PressureSource
 from ..state.clock import Clock

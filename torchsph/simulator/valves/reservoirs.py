@@ -14,7 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchsph.pairs.interface import Backend, per_particle
+from torchsph.pairs.interface import Backend
+from torchsph.pairs.vectors import per_particle
 
 from ..schemes.valve_models import Reservoir
 from ..state.clock import Clock

@@ -13,7 +13,8 @@ import torch
 from torch import Tensor
 
 from torchsph.native.library import REALS, LibraryMissing, WallArguments, address, library
-from torchsph.pairs.interface import PRESSURE_FORMS, per_particle
+from torchsph.pairs.interface import PRESSURE_FORMS
+from torchsph.pairs.vectors import per_particle
 
 from .forces import SMALLEST_FRICTION_DISTANCE, SMALLEST_SHARE, WallSample, completed, friction, wall_pressure_force
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchsph.pairs.interface import square_length
+from torchsph.pairs.vectors import square_length
 
 from ..schemes.wall_models import PotentialWall
 
