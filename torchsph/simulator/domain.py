@@ -22,7 +22,7 @@ from .state.record import Record
 from .state.units import Units
 from .walls.compiled import near_wall
 from .walls.fields import WallFields
-from .walls.forces import WallSample
+from .walls.interface import WallSample
 from .walls.look_up import LookUp
 
 # a particle this far beyond a wall (spacings) counts as outside; the soft potential is meant to be entered a little
@@ -127,7 +127,7 @@ class Domain:
         """The times in (start, stop] at which members meet: key frames, valve events, and ``stop``."""
         times = {stop}
         if self.walls is not None:
-            times.update(self.walls.moments.within(start, stop))
+            times.update(self.walls.key_times.within(start, stop))
         if self.scheme.valve is not None:
             times.update(t for valve in self.scene.valves for t in valve.events(start, stop))
         tolerance = 1e-9 * max(1.0, abs(stop))
@@ -146,7 +146,7 @@ class Domain:
             self._open = tuple(v.region for v in self.scene.valves if v.is_open(middle))
         self.middle = middle  # s, of the present interval
         if self.walls is not None:
-            early, late, *bracket = self.walls.moments.bracket(middle)
+            early, late, *bracket = self.walls.key_times.bracket(middle)
             self._bracket = (bracket[0], bracket[1])
             keys = (self.walls.key(early, self._open), self.walls.key(late, self._open))
             if self._keys is None or keys[0] is not self._keys[0] or keys[1] is not self._keys[1]:

@@ -18,7 +18,8 @@ from .schemes.wall_models import CompleteKernelWall, PotentialWall
 from .state.neighbour_list import PairSearch
 from .state.particles import FLUID, Particles
 from .stepping.pressure import Neighbourhood, packing
-from .walls.forces import potential
+from .walls.interface import complete_sample
+from .walls.potential import potential
 
 if TYPE_CHECKING:
     from .simulator import Simulator
@@ -229,8 +230,8 @@ def relaxed(simulator: Simulator, position: Tensor, mass: float, sweeps: int) ->
         state: PairState = particles.state(particles.deviation)
         terms = RateTerms(continuity=None, concentration=True)
         crowding = search.backend.rates(search.at(particles), state, support, terms).concentration
-        wall = simulator.domain.sample_at(position)
-        move = -0.15 * support.length**2 * (crowding - wall.share_gradient)
+        wall = complete_sample(simulator.domain.sample_at(position))
+        move = -0.15 * support.length**2 * (crowding - wall.completeness_gradient)
         length = move.norm(dim=1, keepdim=True)
         position = position + move * (_LARGEST_MOVE / length.clamp_min(_LARGEST_MOVE))
         wall = simulator.domain.sample_at(position)

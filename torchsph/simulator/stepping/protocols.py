@@ -10,7 +10,7 @@ from torchsph.pairs.interface import Support
 
 from ..state.neighbour_list import PairSearch
 from ..state.particles import Particles
-from ..walls.forces import WallSample
+from ..walls.interface import WallSample
 from .coefficients import Coefficients
 
 

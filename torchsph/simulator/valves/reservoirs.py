@@ -92,7 +92,7 @@ class Reservoirs:
         return times, rate, np.array([self.motion.volume(t) for t in times]) / unit
 
     def _looked_up(self, table: np.ndarray, times: Tensor, dtype: torch.dtype | None = None) -> Tensor:
-        wrapped = [self.domain.walls.moments.wrapped(time) for time in times.tolist()]
+        wrapped = [self.domain.walls.key_times.wrapped(time) for time in times.tolist()]
         value = np.interp(wrapped, self.times, table)
         return torch.as_tensor(value, dtype=dtype or self.domain.dtype, device=self.domain.device)
 
@@ -188,7 +188,7 @@ class Reservoirs:
         """Length of the free channel before the buffer of an opening: 0 where fluid enters in the present interval."""
         if not self.run_out or number in self.given:
             return 0.0
-        inflow = np.interp(self.domain.walls.moments.wrapped(self.domain.middle), self.times, self.flux)
+        inflow = np.interp(self.domain.walls.key_times.wrapped(self.domain.middle), self.times, self.flux)
         return self.run_out if inflow < 0.0 and self._passes(number)[1] else 0.0
 
     def opened(self, particles: Particles) -> Particles:

@@ -14,7 +14,7 @@ from torchsph.pairs.smoothing_kernels import SmoothingKernel
 _PLAIN = 0.97
 
 
-class KernelShare:
+class KernelCompleteness:
     """Integral of the kernel over the fluid, and its gradient, at every node of a grid.
 
     The fluid's indicator, smoothed over one cell as a plane wall would be, is convolved with the kernel and with its
@@ -22,8 +22,11 @@ class KernelShare:
     by face). The nodes' values are such that multilinear interpolation between them is right on the average.
 
     Args:
-        shape: of the grid. step: node spacing, in the unit of ``smoothing_length``.
-        dtype: of the transforms; float32 leaves 1e-6 of the share.
+        shape: of the grid.
+        step: node spacing, in the unit of ``smoothing_length``.
+        kernel: of the pair sums.
+        smoothing_length: h.
+        dtype: of the transforms; float32 leaves 1e-6 of the completeness.
     """
 
     def __init__(
@@ -37,23 +40,29 @@ class KernelShare:
         self._transforms = torch.fft.rfftn(filters.to(dtype), s=self._size, dim=self._axes)
 
     def at(self, distance: Tensor) -> tuple[Tensor, Tensor]:
-        """Share (1, *shape) in [0, 1] and its gradient (D, *shape), components x, y, z.
+        """Completeness (1, *shape) in [0, 1] and its gradient (D, *shape), components x, y, z.
 
-        ``distance`` (*shape): signed, positive in the fluid, in the unit of the step; beyond the grid it continues.
+        Args:
+            distance: (*shape), signed, positive in the fluid, in the unit of the step; beyond the grid it continues.
         """
         spectrum = self._spectrum(self._indicator(distance))
         # one filter at a time: all at once are too large for the processor's cache
-        share, *gradient = (self._back(spectrum * one) for one in self._transforms)
-        return share[None].clamp(0.0, 1.0), torch.stack(gradient)
+        completeness, *gradient = (self._back(spectrum * transform) for transform in self._transforms)
+        return completeness[None].clamp(0.0, 1.0), torch.stack(gradient)
 
     def swept(self, distance: Tensor, speed: Tensor, normal: Tensor) -> Tensor:
-        """Integral of the kernel times the wall's normal speed over its surface, (1, *shape).
+        """Integral of the kernel times the wall's normal speed over its surface.
+
+        Within 1 % in total; smeared a little wider than the completeness's gradient, by up to 7 % of the peak.
+        Nodes that lie between two walls at an edge are left out: their normal belongs to neither of them.
 
         Args:
-            speed: (*shape) of the nearest wall point along ``normal`` (D, *shape), which points into the fluid.
+            distance: (*shape), signed, positive in the fluid, in the unit of the step.
+            speed: (*shape), of the nearest wall point along ``normal``.
+            normal: (D, *shape), unit, into the fluid.
 
-        Within 1 % in total; smeared a little wider than the share's gradient, by up to 7 % of the peak.
-        Nodes that lie between two walls at an edge are left out: their normal belongs to neither of them.
+        Returns:
+            (1, *shape).
         """
         slope = torch.stack(torch.gradient(self._indicator(distance))[::-1]) / self.step
         plain = torch.stack(torch.gradient(distance)).norm(dim=0) > _PLAIN * self.step
@@ -69,8 +78,8 @@ class KernelShare:
         return torch.fft.rfftn(padded, s=self._size, dim=self._axes)
 
     def _back(self, spectrum: Tensor) -> Tensor:
-        inner = (0, *(slice(2 * self._reach, 2 * self._reach + n) for n in self.shape))
-        return torch.fft.irfftn(spectrum, s=self._size, dim=self._axes)[inner]
+        grid = (0, *(slice(2 * self._reach, 2 * self._reach + n) for n in self.shape))
+        return torch.fft.irfftn(spectrum, s=self._size, dim=self._axes)[grid]
 
 
 def _filters(dimension: int, step: float, kernel: SmoothingKernel, smoothing_length: float) -> Tensor:
@@ -81,10 +90,10 @@ def _filters(dimension: int, step: float, kernel: SmoothingKernel, smoothing_len
     radius = mesh.norm(dim=0)
     weight = kernel.value(radius, smoothing_length, dimension)
     slope = kernel.gradient_factor(radius, smoothing_length, dimension) * mesh
-    # discrete normalisation: a full neighbourhood has share 1, a linear indicator the right slope
+    # discrete normalisation: a full neighbourhood has completeness 1, a linear indicator the right slope
     weight = weight / weight.sum()
     slope = slope / -(slope[0] * mesh[0]).sum()
-    # the gradient of the share at x is the sum over y of grad W(x - y): odd in the offset x - y
+    # the gradient of the completeness at x is the sum over y of grad W(x - y): odd in the offset x - y
     return _sharpened(torch.cat([weight[None], slope.flip(0)]))
 
 
