@@ -7,6 +7,8 @@ this cure). The way back is ``pairs.moving_least_squares.fetch_at``.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
 
@@ -98,14 +100,25 @@ def pulled(points: Tensor, velocity: Tensor, grid: Grid, target: Tensor, gain: T
     return torch.where(known, moved, velocity)
 
 
-def fill_beyond(field: Tensor, mask: Tensor, grid: Grid, domain: object, layers: int = 3) -> Tensor:
+def fill_beyond(
+    field: Tensor,
+    mask: Tensor,
+    grid: Grid,
+    walls: Callable[[Tensor], tuple[Tensor, Tensor]] | None,
+    layers: int = 3,
+) -> Tensor:
     """Continue a field beyond its mask, so that interpolation near the edge mixes in nothing foreign.
 
     Behind a wall stands the wall's velocity (no slip); in an open channel, or where there are no walls, the mean of
     the known neighbours continues outward, layer by layer.
 
     Args:
-        field: (B, D, *shape), m/s. mask: (*shape) bool. domain: gives ``sample`` and ``units`` (see ``Domain``).
+        field: (B, D, *shape), m/s.
+        mask: (*shape) bool, where it is known.
+        grid: the nodes, m.
+        walls: gives distance (n,), positive in the fluid, and velocity (n, D), m/s, of the walls at points (n, D)
+            float64, m; None: there are none.
+        layers: nodes beyond the mask that are filled.
     """
     known = mask.clone()
     filled = torch.where(mask, field, torch.zeros_like(field))
@@ -114,14 +127,12 @@ def fill_beyond(field: Tensor, mask: Tensor, grid: Grid, domain: object, layers:
         fresh = ~known & (count[0, 0] > 0)
         filled = torch.where(fresh, total / count.clamp_min(1.0), filled)
         known = known | fresh
-    if domain.walls is None:
+    if walls is None:
         return filled
     beyond = torch.nonzero((known & ~mask).reshape(-1)).squeeze(1)
-    points = grid.nodes(dtype=torch.float64, device=field.device)[beyond] / domain.units.length
-    wall = domain.sample_at(points.to(field.dtype))
-    solid = beyond[wall.distance < 0]
+    distance, velocity = walls(grid.nodes(dtype=torch.float64, device=field.device)[beyond])
     flat = filled.reshape(*filled.shape[:2], -1).clone()
-    flat[:, :, solid] = wall.velocity[wall.distance < 0].T * domain.units.speed
+    flat[:, :, beyond[distance < 0]] = velocity[distance < 0].T
     return flat.reshape(filled.shape)
 
 

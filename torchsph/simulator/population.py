@@ -7,11 +7,11 @@ from the particles around it.  What flows through valves is left to the reservoi
 from __future__ import annotations
 
 import itertools
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
+from torchsph.pairs.cell_search import nearest_image
 from torchsph.pairs.interface import Backend, Moments, Support
 from torchsph.pairs.moving_least_squares import first_order_value
 from torchsph.pairs.smoothing_kernels import kernel
@@ -20,10 +20,8 @@ from torchsph.pairs.vectors import square_length
 from .schemes.population_control import PopulationControl
 from .state.particles import FLUID, Particles
 from .state.record import Record
+from .surroundings import PresentSurroundings
 from .walls.interface import CompleteWallSample
-
-if TYPE_CHECKING:
-    from .domain import Domain
 
 # particles that fill less of what encloses them have a free surface, beyond which there is nothing to seed
 _LEAST_FILLING = 0.9
@@ -39,27 +37,33 @@ class Population:
     """Controls the population of a run; internal units, all members at once."""
 
     def __init__(
-        self, options: PopulationControl, domain: Domain, support: Support, backend: Backend, record: Record
+        self,
+        options: PopulationControl,
+        surroundings: PresentSurroundings,
+        support: Support,
+        backend: Backend,
+        record: Record,
     ) -> None:
-        self.options, self.domain, self._support, self._backend = options, domain, support, backend
+        self.options, self._surroundings, self._support, self._backend = options, surroundings, support, backend
+        self.domain = domain = surroundings.domain
         self._record = record
         zero = torch.zeros(1, dtype=torch.float64)
         self._peak = float(support.kernel.value(zero, support.length, support.dimension))
         self._lower = self._upper = torch.zeros(support.dimension, dtype=domain.dtype, device=domain.device)
         if domain.walls is not None:  # a particle that has got away must not make the grid of cells endless
-            ends = torch.as_tensor(domain.scene.walls.vertices_at_keys, dtype=domain.dtype, device=domain.device)
+            ends = torch.as_tensor(domain.walls.motion.vertices_at_keys, dtype=domain.dtype, device=domain.device)
             ends = ends.reshape(-1, support.dimension) / domain.units.length
             self._lower, self._upper = torch.floor(ends.amin(0)) - 1.0, ends.amax(0) + 1.0
 
     @classmethod
     def of(
-        cls, domain: Domain, backend: Backend, record: Record, particles: Particles, time: float
+        cls, surroundings: PresentSurroundings, backend: Backend, record: Record, particles: Particles, time: float
     ) -> Population | None:
         """The control that the domain's scheme asks for, or None.
 
         Raises ValueError where the particles do not fill what encloses them.
         """
-        scheme = domain.scheme
+        domain, scheme = surroundings.domain, surroundings.domain.scheme
         if scheme.population is None:
             return None
         filling = float(domain.filling(particles, time).min()) if particles.count else 0.0
@@ -68,7 +72,7 @@ class Population:
                 f"population control needs fluid that fills its walls or its box; it fills {100 * filling:.0f} %"
             )
         support = Support(kernel(scheme.kernel), scheme.smoothing_ratio, domain.scene.dimension)
-        return cls(scheme.population, domain, support, backend, record)
+        return cls(scheme.population, surroundings, support, backend, record)
 
     def controlled(self, particles: Particles, due: Tensor) -> tuple[Particles, bool]:
         """Merge and seed in the members where ``due`` (members,) bool; True where that has changed the set."""
@@ -109,7 +113,7 @@ class Population:
                 continue
             way = value[second] - value[first]
             if name == "position":
-                way = self.domain.shortest(way)
+                way = nearest_image(way, self.domain.period)
             weight = part.reshape(-1, *[1] * (value.ndim - 1))
             changes[name] = value.index_copy(0, first, value[first] + weight * way)
         keep = torch.ones_like(particles.fluid).index_fill(0, second, False)
@@ -173,11 +177,11 @@ class Population:
         completeness = torch.ones_like(centre[:, 0])
         fit = torch.ones_like(number, dtype=torch.bool)
         if self.domain.walls is not None and number.numel():
-            wall = self.domain.sample_at(centre)
+            wall = self._surroundings.sample_at(centre)
             # without the kernel's completeness the sum means nothing where walls cut the kernel
             complete = isinstance(wall, CompleteWallSample)
             clear = _CLEARANCE if complete else self._support.radius
-            fit = (wall.distance > clear) & ~self.domain.beyond_valves(centre)
+            fit = (wall.distance > clear) & ~self._surroundings.beyond_valves(centre)
             completeness = wall.completeness if complete else completeness
         member, which = torch.nonzero(empty[:, number[fit]], as_tuple=True)
         centre, completeness = centre[fit][which], completeness[fit][which]

@@ -13,14 +13,13 @@ from torch import Tensor
 
 from torchsph.pairs.vectors import per_particle
 
-from .state.energy import energy_unit
+from .domain import Domain
 from .state.particles import Particles
 from .state.record import Record
 from .walls.interface import FluidAtWalls, WallSample
 from .walls.registry import wall_forces
 
 if TYPE_CHECKING:
-    from .domain import Domain
     from .stepping.protocols import Stepper
 
 
@@ -36,15 +35,14 @@ class WorkAccount:
 
     def __init__(self, domain: Domain, record: Record) -> None:
         self._record, self._walls = record, wall_forces(domain.scheme.wall)
-        self._sources = domain.sources
-        self._moving = domain.walls is not None and bool(domain.scene.walls.rates_at_keys.any())
-        self._unit = energy_unit(domain.units, domain.scene.fluid.density, domain.scene.dimension)
+        self._moving = domain.walls is not None and bool(domain.walls.motion.rates_at_keys.any())
+        self._unit = domain.energy_unit
 
     @classmethod
     def of(cls, domain: Domain, record: Record) -> WorkAccount | None:
         """The account of a scene; None where nothing can do work, so that it costs nothing."""
         account = cls(domain, record)
-        return account if account._moving or account._sources is not None else None
+        return account if account._moving or domain.valves.does_work else None
 
     def note(
         self,
@@ -54,18 +52,23 @@ class WorkAccount:
         step: Tensor,
         stepper: Stepper,
         counts: Tensor,
+        by_valves: Tensor | None,
     ) -> None:
         """Account for one step.
 
         Args:
             before, stepped: the particles before the step and after it, not yet stopped by walls.
-            wall: what they saw. step: (members,), internal. counts: (members,) bool, whose steps were taken.
+            wall: what they saw.
+            step: (members,), internal.
+            stepper: what knows pressure and coefficients.
+            counts: (members,) bool, whose steps were taken.
+            by_valves: (N, D), acceleration by pressure sources, or None.
         """
         if self._moving and wall is not None:
             power = self._power_of_walls(before, stepped, wall, step, stepper) * stepped.mass * stepped.inside
             self._add("wall_work", stepped.per_member(power, "sum"), step, counts)
-        if self._sources is not None and self._sources.push is not None:
-            power = 0.5 * before.mass * (self._sources.push * (before.velocity + stepped.velocity)).sum(1)
+        if by_valves is not None:
+            power = 0.5 * before.mass * (by_valves * (before.velocity + stepped.velocity)).sum(1)
             self._add("source_work", before.per_member(power.double(), "sum"), step, counts)
 
     def _add(self, name: str, power: Tensor, step: Tensor, counts: Tensor) -> None:

@@ -77,7 +77,7 @@ def test_a_sliding_lid_sweeps_nothing():
         run = lid_driven_cavity(across, 100.0, scheme=scheme)
         axis = torch.linspace(0.1, across - 0.1, 60)
         points = torch.cartesian_prod(axis, axis)
-        wall = run.domain.sample_at(points)
+        wall = run.surroundings.sample_at(points)
         nearest = (wall.velocity * wall.completeness_gradient).sum(1)
         rates[sliding] = nearest if wall.swept is None else wall.swept
     assert float(rates[False].abs().max()) > 0.15

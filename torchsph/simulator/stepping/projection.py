@@ -156,7 +156,7 @@ class ProjectionStepper:
         """
         drawn = particles.per_member(prescribed.to(torch.int64), "sum") > 0
         drawn = particles.inside & drawn.index_select(0, particles.member)
-        return torch.where(drawn, around.shortfall(particles), torch.zeros_like(particles.mass))
+        return torch.where(drawn, around.volume_deficit_rate(particles), torch.zeros_like(particles.mass))
 
     def _split(self, force: Tensor | None) -> tuple[Tensor | None, Tensor | None]:
         """A body force (N, D) as the part that only adds its potential to the pressure, and the rest; None for nothing.
