@@ -8,7 +8,6 @@ from dataclasses import dataclass, fields, replace
 import torch
 from torch import Tensor
 
-from ..scene import Fluid
 from ..schemes.projection import Projection
 from ..schemes.weakly_compressible import GammaRamp, WeaklyCompressible
 from ..state.units import Units
@@ -52,14 +51,14 @@ class Parameters:
     valve_strength: float | Tensor = 1.0
 
     @classmethod
-    def of(cls, scheme: WeaklyCompressible | Projection, fluid: Fluid) -> Parameters:
-        """What a scheme and a fluid say."""
+    def of(cls, scheme: WeaklyCompressible | Projection, viscosity: float) -> Parameters:
+        """What a scheme says, for a fluid of dynamic ``viscosity`` (Pa s)."""
         others = ("xsph", "viscosity", "valve_strength")
         given = {f.name: getattr(scheme, f.name) for f in fields(cls) if f.name not in others}
         return cls(
             **given,
             xsph=None if scheme.xsph is None else scheme.xsph.epsilon,
-            viscosity=fluid.viscosity if scheme.laminar_viscosity else None,
+            viscosity=viscosity if scheme.laminar_viscosity else None,
         )
 
     def changed(self, like: Tensor, members: int, **values: float | Sequence[float] | Tensor | None) -> Parameters:
