@@ -9,8 +9,9 @@ import numpy as np
 
 from geometry.grids.grid import Grid
 
+from .errors import RecordingError
 from .recording import LAYOUT, REQUIRED, Recording, Wall
-from .rules import RecordingError
+from .rules import check_recording
 
 ELSEWHERE = "in another file, which is never followed; copy the data into this file"
 # HDF5 filters: deflate (gzip), shuffle, fletcher32, lzf. Others would load code from plug-ins.
@@ -39,7 +40,7 @@ def read_recording(path: str | Path) -> Recording:
             recording = _read(file, source)
         except OSError as fault:
             raise RecordingError(source, "file", f"is damaged: {fault}") from fault
-    recording.check(source)
+    check_recording(recording, source)
     recording.velocity[~np.broadcast_to(recording.mask[:, None], recording.velocity.shape)] = 0
     return recording
 

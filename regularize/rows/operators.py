@@ -17,17 +17,38 @@ CHUNK = 4096  # points per pass: bounds the (points, local_size, C) buffers to a
 
 
 class RowBlock(Protocol):
-    """What the solvers ask of a set of rows."""
+    """What the solvers ask of a set of rows, each of which lives in one knot cell.
 
-    target: torch.Tensor  # (rows,) right-hand side, already weighted
+    Args:
+        knots: the grid of the coefficients.
+        components: C of the field.
+        cell: (groups, A), the cells of the rows, one or more rows each.
+        target: (rows,), right-hand side, already weighted.
+    """
 
-    def matvec(self, c: torch.Tensor) -> torch.Tensor: ...  # (nodes, C) -> (rows,)
+    knots: Knots
+    components: int
+    cell: torch.Tensor
+    target: torch.Tensor
 
-    def rmatvec(self, r: torch.Tensor) -> torch.Tensor: ...  # (rows,) -> (nodes, C)
+    def matvec(self, c: torch.Tensor) -> torch.Tensor:
+        """(nodes, C) -> (rows,)."""
+
+    def rmatvec(self, r: torch.Tensor) -> torch.Tensor:
+        """(rows,) -> (nodes, C), the exact adjoint of :meth:`matvec`."""
 
 
-class _PointRows:
-    """Shared bookkeeping of rows that live at points (n, A) inside the knot box."""
+class PointRows:
+    """Shared bookkeeping of rows that live at points inside the knot box.
+
+    Args:
+        knots: the grid.
+        points: (n, A), m (and s).
+        components: C of the field.
+    """
+
+    weight: torch.Tensor  # (n, C) or (n,), row factors
+    target: torch.Tensor  # (rows,), already weighted
 
     def __init__(self, knots: Knots, points: torch.Tensor, components: int) -> None:
         if points.ndim != 2 or points.shape[1] != knots.axes:
@@ -47,7 +68,7 @@ class _PointRows:
         raise NotImplementedError
 
 
-class VectorRows(_PointRows):
+class VectorRows(PointRows):
     """Rows w_ik v_k(x_i) = w_ik target_ik, one per point and component (the matrix S of thesis eq. 3.7)."""
 
     def __init__(self, knots: Knots, points: torch.Tensor, target: torch.Tensor, weight: torch.Tensor) -> None:
@@ -118,7 +139,7 @@ class VectorRows(_PointRows):
         return one
 
 
-class _CoupledRows(_PointRows):
+class _CoupledRows(PointRows):
     """One row per point, touching all components of the local coefficients."""
 
     def __init__(

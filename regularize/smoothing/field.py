@@ -6,8 +6,7 @@ import torch
 
 from regularize.basis.knots import Knots
 from regularize.errors import InvalidInput
-from regularize.solvers.direct import Factor
-from regularize.solvers.krylov import Solution
+from regularize.solvers.interface import CholeskyFactor, Solution
 from regularize.statistics.likelihood import Choice
 from regularize.statistics.posterior import Posterior
 
@@ -30,7 +29,7 @@ class SplineField:
         left_out: int = 0,
         choice: Choice | None = None,
         posterior: Posterior | None = None,
-        factor: Factor | None = None,
+        factor: CholeskyFactor | None = None,
     ) -> None:
         self.knots, self.coefficients, self.covered = knots, coefficients, covered
         self.solution, self.left_out, self.choice = solution, left_out, choice

@@ -1,24 +1,21 @@
 """From checked samples and options to the row blocks of the system."""
 
 from math import prod
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
 from regularize.basis.knots import Knots
 from regularize.errors import InvalidInput
+from regularize.options import SplineOptions
 from regularize.rows.operators import CellRows, DirectionRows, DivergenceRows, RowBlock, System, VectorRows
 from regularize.rows.penalties import curvature_gram, divergence_gram, row_factor
 from regularize.rows.walls import WallRows
 
 from .samples import FitData
 
-if TYPE_CHECKING:
-    from .smoother import Smoother
 
-
-def knots_for(data: FitData, options: "Smoother") -> Knots:
+def knots_for(data: FitData, options: SplineOptions) -> Knots:
     """The knot grid around the data: of a given spacing, or of given counts with the longest side first."""
     sides = [b - a for a, b in zip(data.lower, data.upper, strict=True)]
     if options.nodes is not None:
@@ -50,12 +47,12 @@ def _knots_of_counts(data: FitData, nodes: tuple[int, ...], sides: list[float], 
     return Knots(tuple(origin), tuple(step), tuple(cells), degree)
 
 
-def build_system(options: "Smoother", knots: Knots, data: FitData) -> System:
+def build_system(options: SplineOptions, knots: Knots, data: FitData) -> System:
     """The rows of thesis eq. 3.22 (plus no-slip and curvature) with the options' scaling."""
     return _thesis_system(options, knots, data) if options.scaling == "thesis" else _density(options, knots, data)
 
 
-def _thesis_system(options: "Smoother", knots: Knots, data: FitData) -> System:
+def _thesis_system(options: SplineOptions, knots: Knots, data: FitData) -> System:
     components = data.components
     blocks = [sample_rows(knots, data, data.weight[:, None])]
     if options.divergence:
@@ -70,7 +67,7 @@ def _thesis_system(options: "Smoother", knots: Knots, data: FitData) -> System:
     return System(knots, components, blocks, options.damping or 0.0)
 
 
-def _density(options: "Smoother", knots: Knots, data: FitData) -> System:
+def _density(options: SplineOptions, knots: Knots, data: FitData) -> System:
     weight = data.weight[:, None] * data.component_weight
     share = data.weight.double().square().sum().sqrt().to(weight)
     fit = sample_rows(knots, data, weight / share)
@@ -87,7 +84,7 @@ def sample_rows(knots: Knots, data: FitData, weight: torch.Tensor) -> VectorRows
 
 
 def penalty_blocks(
-    options: "Smoother", knots: Knots, data: FitData, fit: list[RowBlock]
+    options: SplineOptions, knots: Knots, data: FitData, fit: list[RowBlock]
 ) -> tuple[list[RowBlock], torch.Tensor, float]:
     """Rows of all penalties in the density scaling, the cells they cover, and the damping's row factor."""
     components, extent = data.components, data.extent(knots)
@@ -110,7 +107,7 @@ def penalty_blocks(
     return blocks, cells, (options.damping or 0.0) * (prod(knots.spacing) / extent) ** 0.5
 
 
-def smoothness_gram(options: "Smoother", knots: Knots, data: FitData) -> np.ndarray:
+def smoothness_gram(options: SplineOptions, knots: Knots, data: FitData) -> np.ndarray:
     """(L, L) cell integral of |grad^m v|^2, plus (time_curvature / curvature)^2m |d^m v / dt^m|^2, m the order."""
     gram = curvature_gram(knots, range(data.components), options.order)
     if data.over_time and options.time_curvature:

@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import prod
-from typing import TYPE_CHECKING
 
 import torch
 from scipy.spatial import ConvexHull, QhullError
@@ -11,9 +10,7 @@ from scipy.spatial import ConvexHull, QhullError
 from regularize.basis.knots import Knots
 from regularize.errors import InvalidInput
 from regularize.rows.walls import WallRows
-
-if TYPE_CHECKING:
-    from regularize.statistics.likelihood import Choice
+from regularize.statistics.likelihood import Choice
 
 
 @dataclass(frozen=True)
@@ -86,7 +83,7 @@ class FitData:
         """Whether the last column of the points is the time."""
         return self.points.shape[1] > self.components
 
-    def reweighed(self, choice: "Choice") -> "FitData":
+    def reweighed(self, choice: Choice) -> "FitData":
         """With the robust factors and component noise that an automatic choice found."""
         precision = choice.deviation**-2
         each = (precision / precision.mean()).sqrt().to(self.points)

@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 
 from regularize.rows.operators import System, VectorRows
 from regularize.rows.ordering import Ordering
-from regularize.solvers.direct import Factor
+from regularize.solvers.factor import Factor
 
 CENTRES = 500  # samples whose neighbours are looked at
 REACH = 6.0  # typical distances between samples over which correlation is looked for

@@ -21,7 +21,8 @@ from regularize.basis.knots import Knots
 from regularize.rows.operators import CellRows, DivergenceRows, RowBlock, System, VectorRows
 from regularize.rows.ordering import Ordering, order
 from regularize.solvers.banded import multiply, widen
-from regularize.solvers.direct import SHIFT, Factor, PreparedSystem
+from regularize.solvers.factor import Factor
+from regularize.solvers.prepared import SHIFT, PreparedSystem
 
 from .robust import inflation, robust_weight
 
