@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -60,9 +61,9 @@ def _read(file: h5py.File, source: str) -> Recording:
         raise RecordingError(source, "/velocity", rule)
     grid = _grid(file, dimension, velocity.shape[2:], source)
     names = {dataset: name for name, dataset, _ in LAYOUT}
-    wall = {names[d].removeprefix("wall."): a for d, a in arrays.items() if d.startswith("/wall/")}
-    rest = {names[d]: a for d, a in arrays.items() if not d.startswith("/wall/")}
-    numbers = {name: _number(file, name, source) for name in ("rho", "mu")}
+    wall: dict[str, Any] = {names[d].removeprefix("wall."): a for d, a in arrays.items() if d.startswith("/wall/")}
+    rest: dict[str, Any] = {names[d]: a for d, a in arrays.items() if not d.startswith("/wall/")}
+    numbers: dict[str, Any] = {name: _number(file, name, source) for name in ("rho", "mu")}
     period = _number(file, "period", source) if "period" in file.attrs else 0.0
     try:
         return Recording(

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 
@@ -138,7 +139,7 @@ class Recording:
         The period stays what it is: frames left out do not change the motion that they sample.
         """
         chosen = np.arange(self.frames)[frames if isinstance(frames, slice) else np.asarray(frames)]
-        changes: dict[str, object] = {"wall": self.wall.select(chosen)}
+        changes: dict[str, Any] = {"wall": self.wall.select(chosen)}
         for name, _, _ in LAYOUT:
             value = None if name.startswith("wall.") else getattr(self, name)
             still = name == "valve_intervals" or (
@@ -160,7 +161,7 @@ class Recording:
 
         What belonged to the old velocity (weight, sigma, beam, pressure, fluxes) is dropped.
         """
-        gone = dict.fromkeys(("weight", "beam", "pressure", "flux_mitral", "flux_aortic"))
+        gone: dict[str, Any] = dict.fromkeys(("weight", "beam", "pressure", "flux_mitral", "flux_aortic"))
         text = self.description if description is None else description
         return replace(self, velocity=velocity, sigma=sigma, uncovered=uncovered, description=text, **gone)
 

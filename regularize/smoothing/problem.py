@@ -80,7 +80,10 @@ class Problem:
         prepared = PreparedSystem(self.system)
         factor, fields, members = prepared.factor(), [], []
         for velocity in velocities:
-            fit = self.samples.with_target(velocity)
+            samples = self.samples
+            if not isinstance(samples, VectorRows):
+                raise TypeError("several sample sets at once need full vectors")
+            fit = samples.with_target(velocity)
             knots, components, damping = self.system.knots, self.system.components, self.system.damping
             system = System(knots, components, [fit, *self.system.blocks[1:]], damping)
             members.append(prepared.with_targets(system))

@@ -23,7 +23,7 @@ def knots_for(data: FitData, options: SplineOptions) -> Knots:
             raise InvalidInput("nodes fixes a grid in space alone: over time give knots and time_knots")
         return _knots_of_counts(data, options.nodes, sides, options.degree)
     spacing, space = options.knots, data.components
-    each = [spacing] * space if isinstance(spacing, int | float) else list(spacing)
+    each = [float(spacing)] * space if isinstance(spacing, int | float) else list(spacing or ())
     if data.over_time:
         if options.time_knots is None:
             raise InvalidInput("points hold a time column: give time_knots, the knot distance in s")
@@ -48,13 +48,13 @@ def _knots_of_counts(data: FitData, nodes: tuple[int, ...], sides: list[float], 
 
 
 def build_system(options: SplineOptions, knots: Knots, data: FitData) -> System:
-    """The rows of thesis eq. 3.22 (plus no-slip and curvature) with the options' scaling."""
+    """The rows of Grønli 2017, eq. 3.22 (plus no-slip and curvature) with the options' scaling."""
     return _thesis_system(options, knots, data) if options.scaling == "thesis" else _density(options, knots, data)
 
 
 def _thesis_system(options: SplineOptions, knots: Knots, data: FitData) -> System:
     components = data.components
-    blocks = [sample_rows(knots, data, data.weight[:, None])]
+    blocks: list[RowBlock] = [sample_rows(knots, data, data.weight[:, None])]
     if options.divergence:
         where = data.points if data.divergence_points is None else data.divergence_points
         per_spacing = options.divergence * sum(knots.spacing[:components]) / components
@@ -111,7 +111,7 @@ def smoothness_gram(options: SplineOptions, knots: Knots, data: FitData) -> np.n
     """(L, L) cell integral of |grad^m v|^2, plus (time_curvature / curvature)^2m |d^m v / dt^m|^2, m the order."""
     gram = curvature_gram(knots, range(data.components), options.order)
     if data.over_time and options.time_curvature:
-        ratio = options.time_curvature / options.curvature
+        ratio = options.time_curvature / (options.curvature or 1.0)
         gram = gram + ratio ** (2 * options.order) * curvature_gram(knots, [data.components], options.order)
     return gram
 
@@ -121,9 +121,11 @@ def wall_roots(wall: WallRows) -> torch.Tensor:
     return (wall.weight / wall.weight.sum()).sqrt()
 
 
-def _wall_blocks(knots: Knots, wall: WallRows, normal: float | None, no_slip: float | None, root: torch.Tensor) -> list:
+def _wall_blocks(
+    knots: Knots, wall: WallRows, normal: float | None, no_slip: float | None, root: torch.Tensor
+) -> list[RowBlock]:
     """Normal rows at every wall point, full-vector rows where the wall holds the blood."""
-    blocks = []
+    blocks: list[RowBlock] = []
     if normal:
         target = (wall.normals * wall.velocity).sum(1)
         blocks.append(DirectionRows(knots, wall.points, wall.normals, target, normal * root))

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import prod
+from typing import Any
 
 import torch
 from scipy.spatial import ConvexHull, QhullError
@@ -93,7 +94,7 @@ class FitData:
 
     def cpu(self) -> "FitData":
         """The same data on the CPU."""
-        move = {name: value.cpu() for name, value in vars(self).items() if isinstance(value, torch.Tensor)}
+        move: dict[str, Any] = {name: v.cpu() for name, v in vars(self).items() if isinstance(v, torch.Tensor)}
         wall = None if self.wall is None else self.wall.to(torch.float64, "cpu")
         return replace(self, wall=wall, **move)
 
@@ -108,9 +109,8 @@ class FitData:
     def volume(self) -> float:
         """Volume (area in 2-D) that samples and walls span, in m^D; 0 where they lie in one plane."""
         cloud = self.points if self.wall is None else torch.cat([self.points, self.wall.points])
-        cloud = cloud[:, : self.components].double().cpu().numpy()
         try:
-            return float(ConvexHull(cloud).volume)
+            return float(ConvexHull(cloud[:, : self.components].double().cpu().numpy()).volume)
         except (QhullError, ValueError):  # fewer than D + 1 points, or all in one plane
             return 0.0
 

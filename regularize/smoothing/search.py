@@ -57,7 +57,7 @@ def choose(options: SplineOptions, knots: Knots, data: FitData) -> Choice | None
     with torch.no_grad():
         if options.automatic == "gcv":
             return cross_validate(search, options.no_slip, options.rounds)
-        choice = search.run(guess, options.curvature, options.no_slip, options.divergence, options.rounds)
+        choice = search.run(guess, options.curvature or 0.0, options.no_slip, options.divergence, options.rounds)
         return _counting_shared_errors(options, coarse, data, choice) if options.correlated else choice
 
 
@@ -65,5 +65,6 @@ def _counting_shared_errors(options: SplineOptions, coarse: Knots, data: FitData
     """The choice with what neighbouring samples' errors are found to have in common in a fit on the search's grid."""
     data = data.reweighed(choice)
     problem = Problem(data, build_system(options.with_choice(choice), coarse, data), choice)
-    shared = problem.shared(*solve_direct(problem.system, strict=False))
+    solution, factor = solve_direct(problem.system, strict=False)
+    shared = None if factor is None else problem.shared(solution, factor)
     return choice if shared is None else choice.counting(shared)

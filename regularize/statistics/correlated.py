@@ -105,7 +105,10 @@ class CorrelatedErrors:
         self, system: System, ordering: Ordering, factor: Factor, weight: torch.Tensor, precision: float
     ) -> None:
         self.system, self.ordering, self.factor, self.precision = system, ordering, factor, precision
-        self.fit: VectorRows = system.blocks[0]
+        fit = system.blocks[0]
+        if not isinstance(fit, VectorRows):
+            raise TypeError(f"correlated errors are those of full vectors, not of {type(fit).__name__}")
+        self.fit = fit
         self.rows = self.fit.with_unit_weight().repeated(DRAWS * system.components)
         self.weight = weight[:, None, None]
         self.points = torch.tensor(self.fit.knots.spacing) * (self.fit.cell + self.fit.t)
