@@ -1,9 +1,9 @@
 """LSQR with weights inside the bidiagonalisation, stopping on a gradient that is recomputed.
 
-C. Paige and M. Saunders, LSQR, ACM TOMS 8 (1982); Grønli 2017, eq. 3.23, eq. 3.24, eq. 3.25 and algorithm 2. The recurrence's
-own estimate of the gradient drifts from the truth (in single precision it claims 1e-10 where the truth
-stalls near 1e-4), so it only says when to look: the stop is decided on the gradient recomputed in float64,
-and a run whose recurrence was wrong is restarted from where it stands (iterative refinement).
+C. Paige and M. Saunders, LSQR, ACM TOMS 8 (1982); Grønli 2017, eq. 3.23, eq. 3.24, eq. 3.25 and algorithm 2. The
+recurrence's own estimate of the gradient drifts from the truth (in single precision it claims 1e-10 where the truth
+stalls near 1e-4), so it only says when to look: the stop is decided on the gradient recomputed in float64, and a run
+whose recurrence was wrong is restarted from where it stands (iterative refinement).
 """
 
 from collections.abc import Callable
