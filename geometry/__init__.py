@@ -6,9 +6,10 @@ from .motion.orifices import Orifice, OrificePlane, orifices
 from .motion.refine import refined, refined_motion
 from .motion.wall_motion import WallMotion
 from .motion.wall_points import WallPoints, WallSampler, wall_points
+from .recordings.errors import RecordingError
 from .recordings.read import read_recording
 from .recordings.recording import Recording, Wall
-from .recordings.rules import RecordingError
+from .recordings.rules import check_recording
 from .recordings.write import write_recording
 from .surfaces.closest import Closest, SurfaceIndex
 from .surfaces.distance import GridDistance, distance_and_closest, signed_distance
@@ -42,6 +43,7 @@ __all__ = [
     "WallPoints",
     "WallSampler",
     "box",
+    "check_recording",
     "distance_and_closest",
     "ellipse",
     "ellipsoid",

@@ -10,6 +10,7 @@ import h5py
 import numpy as np
 
 from .recording import Recording
+from .rules import check_recording
 
 
 def write_recording(path: str | Path, recording: Recording) -> None:
@@ -21,7 +22,7 @@ def write_recording(path: str | Path, recording: Recording) -> None:
     OSError where the disk is full. The velocity is stored as 0 outside the mask.
     """
     path = Path(path)
-    recording.check(str(path))
+    check_recording(recording, str(path))
     if not path.parent.is_dir():
         raise FileNotFoundError(f"{path}: there is no directory {path.parent}; make it first")
     handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".part", dir=path.parent)

@@ -119,7 +119,7 @@ def test_missing_velocities_have_no_weight(measured):
 def test_ensemble_and_particle_filter_stay_well_below_raw(measured, truth, model, splines, smoothed):
     raw = nrmse(np.nan_to_num(measured.velocity), truth, measured.mask)
     run = assimilate(measured, model, members=4, splines=splines, smoothed=smoothed, seed=1)
-    run.recording.check("ensemble")
+    geometry.check_recording(run.recording, "ensemble")
     assert nrmse(run.recording.velocity, truth, measured.mask) < 0.5 * raw
     assert run.recording.sigma is not None
     inside = np.moveaxis(run.recording.sigma, 1, -1)[measured.mask]
@@ -127,7 +127,7 @@ def test_ensemble_and_particle_filter_stay_well_below_raw(measured, truth, model
     again = assimilate(measured, model, members=4, splines=splines, smoothed=smoothed, seed=1)
     np.testing.assert_array_equal(again.recording.velocity, run.recording.velocity)
     particles = filter_sph(measured, model, error=estimate_error(measured, splines, smoothed), seed=1)
-    particles.recording.check("sph")
+    geometry.check_recording(particles.recording, "sph")
     assert nrmse(particles.recording.velocity, truth, measured.mask) < 0.8 * raw
 
 
