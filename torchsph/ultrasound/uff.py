@@ -16,7 +16,7 @@ import torch
 
 from geometry import Grid
 
-from .scanner.acquisition import Acquisition, Beams, Packet
+from .acquisition import Acquisition, Beams, Packet
 
 
 @dataclass(frozen=True, eq=False)

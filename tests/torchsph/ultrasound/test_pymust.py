@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from geometry import Grid
-from torchsph.ultrasound.scanner.acquisition import Acquisition, Beams
+from torchsph.ultrasound.acquisition import Acquisition, Beams
 from torchsph.ultrasound.scanner.echoes import EchoModel, simulate_packet
 from torchsph.ultrasound.scanner.flow import LinearFlow
 from torchsph.ultrasound.scanner.image import ParallelImager

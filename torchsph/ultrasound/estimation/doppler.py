@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from ..scanner.acquisition import Packet
+from ..acquisition import Packet
 from .box_sums import box_sum
 from .clutter import ClutterFilter, FIRFilter
 

@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from ..scanner.acquisition import decibel
+from ..acquisition import decibel
 from .estimates import Flag, bit
 from .prepared import Prepared
 

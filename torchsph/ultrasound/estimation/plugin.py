@@ -28,7 +28,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from ..scanner.acquisition import Packet
+from ..acquisition import Packet
 from .clutter import ClutterFilter
 from .estimates import Estimates, Flag
 

@@ -10,7 +10,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ..scanner.acquisition import Packet
+from ..acquisition import Packet
 from .backends import Backend
 from .clutter import ClutterFilter
 from .correlation import KernelShape

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from ..scanner.acquisition import Acquisition, Packet, decibel
+from ..acquisition import Acquisition, Packet, decibel
 from .backends import NAMES, backend
 from .clutter import ClutterFilter, FIRFilter
 from .correlation import KernelShape

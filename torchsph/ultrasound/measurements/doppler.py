@@ -9,8 +9,8 @@ import torch
 
 from geometry import Recording
 
+from ..acquisition import Beams
 from ..estimation.doppler import ColourDoppler, colour_doppler, vector_doppler
-from ..scanner.acquisition import Beams
 from .scanning import Canvas, ScannerOptions, scanned
 
 

@@ -16,8 +16,7 @@ import torch
 from torch import Tensor
 
 from geometry import Recording
-
-from ..estimation.box_sums import fwhm_to_deviation, masked_blur, masked_gradient, smooth_noise
+from geometry.grids.fields import fwhm_to_deviation, masked_blur, masked_gradient, smooth_noise
 
 WEIGHT_FLOOR = 0.02  # a node that was measured at all keeps some weight: 0 is reserved for "nothing measured"
 

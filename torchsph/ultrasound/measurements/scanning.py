@@ -13,8 +13,8 @@ from tqdm import tqdm
 
 from geometry import Grid, Recording
 
+from ..acquisition import Acquisition, Beams, Packet
 from ..estimation.clutter import ClutterFilter, FIRFilter, PolynomialFilter, SVDFilter
-from ..scanner.acquisition import Acquisition, Beams, Packet
 from ..scanner.echoes import EchoModel, simulate_packet
 from ..scanner.flow import RecordingFlow
 from ..scanner.pointspread import GaussianPointSpread, SectorPointSpread

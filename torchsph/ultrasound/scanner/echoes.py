@@ -9,7 +9,7 @@ import torch
 
 from geometry import Grid
 
-from .acquisition import Acquisition, Beams, Packet
+from ..acquisition import Acquisition, Beams, Packet
 from .flow import Flow
 from .image import Imager, ParallelImager
 from .pointspread import GaussianPointSpread, PointSpread, SectorPointSpread

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from geometry import Grid
 
-from .acquisition import Acquisition, Beams
+from ..acquisition import Acquisition, Beams
 from .convolution import Convolution
 from .gridding import fast_length
 from .pointspread import PointSpread

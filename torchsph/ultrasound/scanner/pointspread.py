@@ -9,7 +9,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from ..estimation.box_sums import fwhm_to_deviation
+from geometry.grids.fields import fwhm_to_deviation
 
 EXTENT = 3.7  # deviations at which a Gaussian has fallen to 1e-3: cut in space
 BAND = 3.0  # deviations kept free of aliasing in k-space, where the Gaussian has fallen to 1e-2

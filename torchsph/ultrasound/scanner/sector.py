@@ -14,7 +14,7 @@ from torch import Tensor
 
 from geometry import Grid
 
-from .acquisition import Acquisition, Beams
+from ..acquisition import Acquisition, Beams
 from .convolution import Convolution
 from .pointspread import SectorPointSpread
 
