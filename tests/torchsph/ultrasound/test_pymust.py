@@ -1,6 +1,6 @@
 """Our images beside those of PyMUST, which computes the pressure field of every element of an array.
 
-The numbers in pymust_plane.npz were made by examples/benchmarks/tracking_pymust.py.
+The numbers in pymust_plane.npz were made by examples/benchmarks/ultrasound/tracking_pymust.py.
 """
 
 from pathlib import Path

@@ -1,6 +1,6 @@
 """How fast the speckle tracker is: beside a plain SciPy program and OpenPIV, in one run on the same volumes.
 
-    python examples/benchmarks/tracking_speed.py [--quick] [--json FILE]
+    python examples/benchmarks/ultrasound/tracking_speed.py [--quick] [--json FILE]
 
 The plain program goes point by point and pair by pair, with `scipy.signal.correlate` (directly and by Fourier
 transforms) and the same pooled normalisation, search and parabola; a third one, tuned by hand, transforms all
