@@ -1,7 +1,7 @@
-"""What PyMUST images of the scatterers that tests/test_ultrasound_pymust.py gives to our imager.
+"""What PyMUST images of the scatterers that tests/torchsph/ultrasound/estimation/test_pymust.py gives to our imager.
 
     pip install pymust
-    python examples/benchmarks/ultrasound/tracking_pymust.py --out tests/torchsph/ultrasound/pymust_plane.npz
+    python examples/benchmarks/ultrasound/tracking_pymust.py --out tests/torchsph/ultrasound/estimation/pymust_plane.npz
         [--quick] [--json FILE]
 
 PyMUST (Garcia, Comput. Methods Programs Biomed. 218, 2022) computes the pressure field of every element of a

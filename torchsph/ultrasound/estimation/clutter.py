@@ -1,15 +1,15 @@
 """Clutter filters: what separates blood from bright, slow tissue, along the images of a packet.
 
 Overview and the response of regression filters: Bjaerum, Torp & Kristoffersen 2002. All filters act on IQ samples
-(T, *shape) and keep only images that are free of transients. A further one is a class with the three methods of
-:class:`ClutterFilter` and an entry of ``CLUTTER_FILTERS``, by which options, tests and the command line find it.
+(T, *shape) and keep only images that are free of transients. A further one is a class that meets
+:class:`ClutterFilter` and an entry of ``CLUTTER_FILTERS``, by which options and tests find it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import numpy as np
 import torch
@@ -20,7 +20,13 @@ IMAGES_AT_ONCE = 16  # that an FIR filter makes: more of them would multiply mos
 
 
 class ClutterFilter(Protocol):
-    """A filter over the images of a packet."""
+    """A filter over the images of a packet, which stops what does not move.
+
+    ``adaptive`` says whether what it removes depends on the data; else it is linear, and ``response`` and
+    ``noise_gain`` are exact.
+    """
+
+    adaptive: ClassVar[bool]
 
     def apply(self, iq: Tensor) -> Tensor:
         """Filtered samples (T', *shape), T' <= T.
@@ -54,6 +60,8 @@ class FIRFilter:
         taps: number of coefficients, odd.
         cutoff: cut-off frequency, as a fraction of half the PRF.
     """
+
+    adaptive: ClassVar[bool] = False
 
     taps: int = 9
     cutoff: float = 0.12
@@ -111,6 +119,8 @@ class PolynomialFilter:
         order: of the polynomial; 0 removes the mean.
     """
 
+    adaptive: ClassVar[bool] = False
+
     order: int = 3
 
     def __post_init__(self) -> None:
@@ -151,6 +161,8 @@ class SVDFilter:
     Args:
         rank: how many of them.
     """
+
+    adaptive: ClassVar[bool] = True
 
     rank: int = 2
 
