@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable
 from typing import NoReturn
 
-from torchsph._version import __version__
+from torchsph import __version__
 
 __all__ = ["OUT", "build_parser"]
 

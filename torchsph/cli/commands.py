@@ -15,8 +15,7 @@ import numpy as np
 import torch
 
 import geometry
-from torchsph import data
-from torchsph._version import __version__
+from torchsph import __version__, data
 from torchsph.assimilation import filter_figure
 from torchsph.evaluation import figures as report
 from torchsph.evaluation import metrics

@@ -1,7 +1,8 @@
-"""What PyMUST images of the scatterers that tests/test_ultrasound_pymust.py gives to our imager.
+"""What PyMUST images of the scatterers that tests/torchsph/ultrasound/estimation/test_pymust.py gives to our imager.
 
     pip install pymust
-    python examples/benchmarks/tracking_pymust.py --out tests/pymust_plane.npz [--quick] [--json FILE]
+    python examples/benchmarks/ultrasound/tracking_pymust.py --out tests/torchsph/ultrasound/estimation/pymust_plane.npz
+        [--quick] [--json FILE]
 
 PyMUST (Garcia, Comput. Methods Programs Biomed. 218, 2022) computes the pressure field of every element of a
 linear array in the frequency domain, receives, demodulates and beamforms. Here: an L11-5v, one plane wave,

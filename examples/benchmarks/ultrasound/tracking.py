@@ -1,6 +1,6 @@
 """How well the speckle tracker works: bias and deviation against everything that makes it worse.
 
-    python examples/benchmarks/tracking.py [PART ...] [--quick] [--out FOLDER] [--json FILE]
+    python examples/benchmarks/ultrasound/tracking.py [PART ...] [--quick] [--out FOLDER] [--json FILE]
 
 Parts: speed angle shear snr clutter dropout memory calibration response; without names all of them (ten
 minutes on one quiet core). Uniform or sheared motion of 5 MHz echoes, point spread 0.5 mm axial and 1.2 mm across

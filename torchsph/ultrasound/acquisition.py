@@ -1,4 +1,7 @@
-"""What a scanner does to make a packet of images: frequencies, beams, and the IQ samples that result."""
+"""What a scanner does to make a packet of images: frequencies, beams, and the IQ samples that result.
+
+The ground on which the simulated scanner and the estimators meet: neither knows the other.
+"""
 
 from __future__ import annotations
 
@@ -15,8 +18,11 @@ from geometry import Grid
 class Acquisition:
     """Timing and wave of an acquisition.
 
-    frequency: centre frequency, Hz. sound_speed: m/s. prf: image repetition frequency, Hz. packet: images
-    taken in a row of one velocity estimate.
+    Args:
+        frequency: Hz, the centre frequency.
+        sound_speed: m/s.
+        prf: Hz, how often an image is taken.
+        packet: images taken in a row for one velocity estimate.
     """
 
     frequency: float = 5e6
@@ -52,7 +58,9 @@ class Acquisition:
 class Beams:
     """Where the beams point: parallel along ``direction``, or fanning out from ``apex`` on both sides of it.
 
-    direction: D numbers, made a unit vector, in which sound leaves the probe. apex: D numbers, m.
+    Args:
+        direction: (D,), in which sound leaves the probe; made a unit vector.
+        apex: (D,), m, from which the beams fan out; ``None`` = parallel beams.
     """
 
     direction: tuple[float, ...] = (0.0, 0.0, 1.0)
@@ -68,6 +76,7 @@ class Beams:
 
     @property
     def dimension(self) -> int:
+        """Dimension D of the space that the beams scan, 2 or 3."""
         return len(self.direction)
 
     def across(self) -> tuple[tuple[float, ...], ...]:
@@ -91,12 +100,18 @@ class Beams:
 
 @dataclass(frozen=True, eq=False)
 class Packet:
-    """IQ samples (T, *shape), complex64 or complex128, of T images on a grid.
+    """IQ samples of T images on a grid.
 
     The baseband convention is that of demodulation at the depth of the sample: an echo from depth z
     carries the phase exp(-i 4 pi f z / c), so motion away from the probe turns the phase backwards.
-    ``noise`` is the power of the thermal noise per sample where it is known (scanners measure it with the
-    transmitter off).
+
+    Args:
+        iq: (T, *shape), complex64 or complex128, the samples.
+        grid: where the samples lie.
+        acquisition: how they were taken.
+        beams: along which beams.
+        noise: power of the thermal noise per sample where it is known (scanners measure it with the
+            transmitter off).
     """
 
     iq: Tensor

@@ -8,10 +8,10 @@ import torch
 from ultrasound_cases import STEP, cube, lattice, packet
 
 from geometry import Grid
+from torchsph.ultrasound.acquisition import Acquisition, Beams, Packet
 from torchsph.ultrasound.estimation.clutter import FIRFilter
 from torchsph.ultrasound.estimation.estimates import Flag
 from torchsph.ultrasound.estimation.tracking import SpeckleTracker
-from torchsph.ultrasound.scanner.acquisition import Acquisition, Beams, Packet
 from torchsph.ultrasound.scanner.echoes import EchoModel, simulate_packet
 
 PLAIN = SpeckleTracker(clutter=None)

@@ -7,11 +7,11 @@ import torch
 from ultrasound_cases import cube, lattice
 
 from geometry import Grid
-from torchsph.ultrasound.estimation.box_sums import fwhm_to_deviation
+from geometry.grids.fields import fwhm_to_deviation
+from torchsph.ultrasound.acquisition import Acquisition, Beams
 from torchsph.ultrasound.estimation.doppler import ColourDoppler, colour_doppler
 from torchsph.ultrasound.estimation.tracking import SpeckleTracker
 from torchsph.ultrasound.measurements.doppler import DopplerOptions
-from torchsph.ultrasound.scanner.acquisition import Acquisition, Beams
 from torchsph.ultrasound.scanner.echoes import EchoModel, simulate_packet
 from torchsph.ultrasound.scanner.flow import LinearFlow
 from torchsph.ultrasound.scanner.pointspread import GaussianPointSpread, SectorPointSpread

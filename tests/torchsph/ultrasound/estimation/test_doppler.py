@@ -7,9 +7,9 @@ import pytest
 import torch
 from ultrasound_cases import cube, lattice, packet
 
+from torchsph.ultrasound.acquisition import Acquisition, Beams, Packet
 from torchsph.ultrasound.estimation.doppler import ColourDoppler, colour_doppler, vector_doppler
 from torchsph.ultrasound.measurements.doppler import DopplerOptions
-from torchsph.ultrasound.scanner.acquisition import Acquisition, Beams, Packet
 
 PLAIN = ColourDoppler(clutter=None)
 

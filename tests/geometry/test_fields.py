@@ -5,10 +5,9 @@ import math
 import numpy as np
 import pytest
 import torch
-from scipy.ndimage import gaussian_filter, uniform_filter1d
+from scipy.ndimage import gaussian_filter
 
-from torchsph.ultrasound.estimation.box_sums import (
-    box_sum,
+from geometry.grids.fields import (
     fwhm_to_deviation,
     gaussian_kernel,
     masked_blur,
@@ -75,13 +74,6 @@ def test_gradient_is_zero_at_a_lonely_node():
     mask = torch.zeros((3, 3), dtype=torch.bool)
     mask[1, 1] = True
     assert not masked_gradient(torch.ones((2, 3, 3)), mask, (1e-3, 1e-3)).any()
-
-
-@pytest.mark.parametrize("nodes", [1, 3, 7, 13, 25])
-def test_box_sums_equal_scipy_averages(nodes):
-    field = torch.randn((6, 15, 4), generator=torch.Generator().manual_seed(5), dtype=torch.complex128)
-    expected = uniform_filter1d(field.numpy(), nodes, axis=1, mode="constant") * nodes
-    np.testing.assert_allclose(box_sum(field, nodes, 1).numpy(), expected, atol=1e-12)
 
 
 def test_a_kernel_without_width_is_refused():

@@ -30,7 +30,7 @@ def test_correlation_equals_its_definition_at_every_lag(name, dtype, close, imag
     volume, shape = random_volume(dtype=dtype, images=images), KernelShape((2, 1, 1), (1, 2, 1))
     corner, offset = torch.tensor([[4, 5, 5], [8, 6, 7], [14, 13, 12]]), torch.tensor([[0, 0, 0], [1, -1, 2], [0] * 3])
     ramp = torch.tensor([[0.3, 0.0, -0.2], [0.0, 0.1, 0.0], [0.0, 0.0, 0.0]], dtype=dtype)
-    rho = backends.backend(name).correlate(volume, 2, corner, offset, shape, ramp=ramp).numpy()
+    rho = backends.choose_backend(name).correlate(volume, 2, corner, offset, shape, ramp=ramp).numpy()
     samples = volume.numpy().astype(np.complex128)
     for point in range(3):
         z, y, x = corner[point].tolist()
@@ -50,7 +50,7 @@ def test_correlation_equals_its_definition_at_every_lag(name, dtype, close, imag
 def test_a_silent_kernel_correlates_with_nothing(name):
     volume = torch.zeros((20, 18, 16, 3), dtype=torch.complex64)
     shape, still = KernelShape((1,) * 3, (1,) * 3), torch.zeros((1, 3), dtype=torch.long)
-    assert not backends.backend(name).correlate(volume, 1, torch.tensor([[5, 5, 5]]), still, shape).abs().any()
+    assert not backends.choose_backend(name).correlate(volume, 1, torch.tensor([[5, 5, 5]]), still, shape).abs().any()
 
 
 @pytest.mark.skipif(not COMPILED, reason="no C++ compiler: there are no compiled sums to compare with torch's")
@@ -60,16 +60,16 @@ def test_compiled_sums_over_images_and_boxes_are_those_of_torch(dtype, close):
     margin, half = (3, 2, 4), (2, 1, 3)
     middle = torch.tensor([[3, 2, 4], [22, 19, 19], [12, 9, 12]])
     found = []
-    for one in map(backends.backend, BACKENDS):
-        volume, power, turn = one.arrange(images, margin, turns=True)
+    for backend in map(backends.choose_backend, BACKENDS):
+        volume, power, turn = backend.arrange(images, margin, turns=True)
         found.append(
             [
                 volume,
                 power,
                 turn,
-                one.mean_power(images),
-                one.box_sums(power, middle, half),
-                *(one.sums_around(turn, widths)(middle) for widths in (half, (0, 9, 5))),
+                backend.mean_power(images),
+                backend.box_sums(power, middle, half),
+                *(backend.sums_around(turn, widths)(middle) for widths in (half, (0, 9, 5))),
             ]
         )
     for compiled, reference in zip(found[1], found[0], strict=True):
@@ -78,7 +78,7 @@ def test_compiled_sums_over_images_and_boxes_are_those_of_torch(dtype, close):
 
 @pytest.mark.skipif(not COMPILED, reason="no C++ compiler: torch decides how its sums are split")
 def test_the_number_of_threads_changes_nothing():
-    sums, volume = backends.backend("cpu"), random_volume(dtype=torch.float32)
+    sums, volume = backends.choose_backend("cpu"), random_volume(dtype=torch.float32)
     generator = torch.Generator().manual_seed(2)
     corner, shape = torch.randint(4, 9, (40, 3), generator=generator), KernelShape((1,) * 3, (2,) * 3)
     lattice, points = Gridding((0.0,) * 3, (1.0,) * 3, (9, 10, 11)), 12 * torch.rand((300, 3), generator=generator)
@@ -98,10 +98,10 @@ def test_what_was_asked_for_by_name_and_is_missing_is_an_error(monkeypatch):
         raise LibraryMissing("no compiler here")
 
     monkeypatch.setattr(backends, "library", missing)
-    assert backends.backend().name == "reference"
+    assert backends.choose_backend().name == "reference"
     for arguments, message in ((("cpu",), "no compiler here"), (("cpu", "cuda"), "on 'cuda'"), (("gpu",), "unknown")):
         with pytest.raises(ValueError, match=message):
-            backends.backend(*arguments)
+            backends.choose_backend(*arguments)
 
 
 @pytest.mark.skipif(not COMPILED, reason="no C++ compiler: torch itself refuses nodes outside a volume")
@@ -109,7 +109,7 @@ def test_kernels_outside_the_volume_are_refused():
     volume, shape, still = random_volume(), KernelShape((1,) * 3, (1,) * 3), torch.zeros((1, 3), dtype=torch.long)
     for corner in ([0, 5, 5], [5, 5, 13]):
         with pytest.raises(IndexError, match="volume of"):
-            backends.backend("cpu").correlate(volume, 1, torch.tensor([corner]), still, shape)
+            backends.choose_backend("cpu").correlate(volume, 1, torch.tensor([corner]), still, shape)
 
 
 def gaussian_peak(curve, vertex, lags):

@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from geometry import Grid
-from torchsph.ultrasound.estimation.box_sums import fwhm_to_deviation
+from geometry.grids.fields import fwhm_to_deviation
+from torchsph.ultrasound.acquisition import Acquisition, Beams, Packet
 from torchsph.ultrasound.scanner import gridding
-from torchsph.ultrasound.scanner.acquisition import Acquisition, Beams, Packet
 from torchsph.ultrasound.scanner.gridding import Gridding, fast_length
 from torchsph.ultrasound.scanner.image import ParallelImager, resize_spectrum
 from torchsph.ultrasound.scanner.pointspread import GaussianPointSpread, SampledPointSpread

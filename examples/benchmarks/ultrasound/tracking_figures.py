@@ -1,6 +1,6 @@
-"""Figures of examples/benchmarks/tracking.py: errors against what makes them, and the filters' responses.
+"""Figures of examples/benchmarks/ultrasound/tracking.py: errors against what makes them, and the filters' responses.
 
-python examples/benchmarks/tracking_figures.py RESULTS.json --out FOLDER
+python examples/benchmarks/ultrasound/tracking_figures.py RESULTS.json --out FOLDER
 """
 
 from __future__ import annotations

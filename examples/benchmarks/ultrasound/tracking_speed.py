@@ -1,6 +1,6 @@
 """How fast the speckle tracker is: beside a plain SciPy program and OpenPIV, in one run on the same volumes.
 
-    python examples/benchmarks/tracking_speed.py [--quick] [--json FILE]
+    python examples/benchmarks/ultrasound/tracking_speed.py [--quick] [--json FILE]
 
 The plain program goes point by point and pair by pair, with `scipy.signal.correlate` (directly and by Fourier
 transforms) and the same pooled normalisation, search and parabola; a third one, tuned by hand, transforms all
@@ -28,7 +28,7 @@ from tracking import CENTRE, STEP, image_grid, lattice
 
 from geometry import Grid
 from torchsph.ultrasound import EchoModel, LinearFlow, Packet, SpeckleTracker, simulate_packet
-from torchsph.ultrasound.estimation.backends import backend
+from torchsph.ultrasound.estimation.backends import choose_backend
 from torchsph.ultrasound.estimation.correlation import KernelShape
 
 PHANTOM = (20e-3, 20e-3, 33e-3)  # x, y, z, m
@@ -71,7 +71,7 @@ def plain_scipy(
 def our_heights(packet: Packet, points: torch.Tensor, search: int = 2, half: int = 3) -> np.ndarray:
     """|rho| (n, 5, 5, 5) of the same search here."""
     corner = packet.grid.locate(points).round().long().flip(-1) - half
-    volume, sums = packet.iq.movedim(0, -1).contiguous(), backend()
+    volume, sums = packet.iq.movedim(0, -1).contiguous(), choose_backend()
     rho = sums.correlate(volume, 1, corner, torch.zeros_like(corner), KernelShape((half,) * 3, (search,) * 3))
     return rho.abs().numpy()
 

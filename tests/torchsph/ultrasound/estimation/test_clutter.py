@@ -62,28 +62,12 @@ def test_svd_filter_removes_what_numpy_calls_the_strongest_components():
     np.testing.assert_allclose(SVDFilter(2).apply(iq).numpy(), (left * values) @ right, atol=1e-10)
 
 
-@pytest.mark.parametrize("filtering", [FIRFilter(), PolynomialFilter(2)])
-def test_white_noise_keeps_the_stated_share(filtering):
-    generator = torch.Generator().manual_seed(1)
-    noise = torch.view_as_complex(torch.randn((16, 20000, 2), generator=generator) * math.sqrt(0.5))
-    kept = float(filtering.apply(noise).abs().square().mean())
-    assert kept == pytest.approx(filtering.noise_gain(16), rel=0.03)
-
-
 @pytest.mark.parametrize("filtering", [FIRFilter(), PolynomialFilter(2), SVDFilter(1)])
 def test_tissue_of_sixty_decibel_goes_and_fast_blood_stays(filtering):
     still = 1e3 * torch.ones((16, 50), dtype=torch.complex128)
     blood = tone(0.3) * torch.exp(1j * torch.arange(50, dtype=torch.float64))
     left = filtering.apply(still + blood)
     assert float(left.abs().square().mean()) == pytest.approx(1, abs=0.5)
-
-
-def test_a_nan_sample_does_not_spoil_the_others():
-    iq = torch.ones((16, 6), dtype=torch.complex64)
-    iq[3, 2] = float("nan")
-    for filtering in (FIRFilter(), PolynomialFilter(1), SVDFilter(1)):
-        bad = torch.isnan(filtering.apply(iq).real).any(0)
-        assert not bad[[0, 1, 3, 4, 5]].any()
 
 
 @pytest.mark.parametrize(

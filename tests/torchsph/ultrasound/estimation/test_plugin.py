@@ -8,10 +8,10 @@ import pytest
 import torch
 from ultrasound_cases import STEP, cube, lattice, packet
 
+from torchsph.ultrasound.acquisition import Beams
 from torchsph.ultrasound.estimation.estimates import Flag
 from torchsph.ultrasound.estimation.plugin import LibraryTracker, Tracker
 from torchsph.ultrasound.estimation.tracking import SpeckleTracker
-from torchsph.ultrasound.scanner.acquisition import Beams
 
 COMPILER = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
 SOURCE = Path(__file__).parent / "tracker.c"

@@ -3,8 +3,8 @@
 import torch
 from ultrasound_cases import cube, lattice, packet
 
+from torchsph.ultrasound.acquisition import Beams
 from torchsph.ultrasound.estimation.tracking import SpeckleTracker
-from torchsph.ultrasound.scanner.acquisition import Beams
 
 PLAIN = SpeckleTracker(clutter=None)
 

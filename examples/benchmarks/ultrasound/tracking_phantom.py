@@ -1,6 +1,7 @@
 """Speckle tracking of a ventricle's echoes: figures 4.4 and 4.5 of the thesis, calibration, and the whole loop.
 
-    python examples/benchmarks/tracking_phantom.py TRUE.h5 [--first F --last F --every K] [--loop] [--out FOLDER]
+    python examples/benchmarks/ultrasound/tracking_phantom.py TRUE.h5 [--first F --last F --every K] [--loop]
+        [--out FOLDER]
         [--json FILE] [--quick]
 
 TRUE.h5: a recording of the true flow, which neither tracker nor calibration has seen. Its echoes are simulated

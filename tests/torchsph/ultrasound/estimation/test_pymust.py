@@ -1,6 +1,6 @@
 """Our images beside those of PyMUST, which computes the pressure field of every element of an array.
 
-The numbers in pymust_plane.npz were made by examples/benchmarks/tracking_pymust.py.
+The numbers in pymust_plane.npz were made by examples/benchmarks/ultrasound/tracking_pymust.py.
 """
 
 from pathlib import Path
@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from geometry import Grid
-from torchsph.ultrasound.scanner.acquisition import Acquisition, Beams
+from torchsph.ultrasound.acquisition import Acquisition, Beams
 from torchsph.ultrasound.scanner.echoes import EchoModel, simulate_packet
 from torchsph.ultrasound.scanner.flow import LinearFlow
 from torchsph.ultrasound.scanner.image import ParallelImager
