@@ -1,0 +1,1 @@
+"""What people read out of a flow: vorticity, energy, forces, flow rates, vortices, pressure, transit of blood."""
