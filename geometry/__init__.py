@@ -6,6 +6,8 @@ from .motion.orifices import Orifice, OrificePlane, orifices
 from .motion.refine import refined, refined_motion
 from .motion.wall_motion import WallMotion
 from .motion.wall_points import WallPoints, WallSampler, wall_points
+from .recordings.checks import findings
+from .recordings.finding import Finding
 from .recordings.read import read_recording
 from .recordings.recording import Recording, Wall
 from .recordings.rules import RecordingError
@@ -23,6 +25,7 @@ from .ventricle.ventricle import Beat, Ventricle
 __all__ = [
     "Beat",
     "Closest",
+    "Finding",
     "Grid",
     "GridDistance",
     "MovingDistance",
@@ -45,6 +48,7 @@ __all__ = [
     "distance_and_closest",
     "ellipse",
     "ellipsoid",
+    "findings",
     "grid_winding",
     "labelled",
     "orifices",

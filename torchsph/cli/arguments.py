@@ -124,6 +124,7 @@ def _info(parser: Parser, _: tuple[str, ...]) -> None:
     """Check a recording against the format and summarise it."""
     parser.add_argument("file", nargs="?", metavar="FILE")
     parser.add_argument("--backends", action="store_true", help="list the pair kernels of this machine")
+    parser.add_argument("--strict", action="store_true", help="refuse whatever else is odd about the recording")
 
 
 def _model(parser: Parser, presets: tuple[str, ...]) -> None:
