@@ -17,7 +17,7 @@ FRAMES = 3
 OUTSIDE = 0.1  # share of mask nodes outside the wall that is told: voxels along a wall may lie half outside
 CONTRADICTED = 0.5  # share above which mask and wall cannot belong together
 EMPTY = 0.5  # share of the nodes inside the wall that are missing from the mask
-OFF = 0.05  # relative difference of volumes
+OFF = 0.15  # relative difference of volumes: that of a coarse wall of triangles reaches a tenth
 FLICKER = 1.2  # RMS of the steps' changes over that of the steps: 1.7 for pure noise, below .5 for motion
 
 

@@ -12,6 +12,8 @@ from typing import NoReturn
 
 from torchsph._version import __version__
 
+from . import convert
+
 __all__ = ["OUT", "build_parser"]
 
 OUT = "torchsph-out"
@@ -36,6 +38,7 @@ def build_parser(commands: dict[str, Callable[[argparse.Namespace], None]], pres
         ("measure", _measure),
         ("smooth", _smooth),
         ("info", _info),
+        ("convert", convert.describe),
     ):
         text = (describe.__doc__ or "").strip()
         sub = subparsers.add_parser(name, help=text.splitlines()[0], description=text)

@@ -25,6 +25,7 @@ from torchsph.methods.frame_splines import smooth as smooth_recording
 from torchsph.methods.runtime import parallel
 
 from .arguments import LEADS
+from .convert import convert
 from .findings import tell_findings
 from .outputs import output_folder, staged, write_json
 
@@ -331,4 +332,5 @@ COMMANDS = {
     "measure": measure,
     "smooth": smooth,
     "info": info,
+    "convert": convert,
 }
