@@ -6,7 +6,9 @@ from .motion.orifices import Orifice, OrificePlane, orifices
 from .motion.refine import refined, refined_motion
 from .motion.wall_motion import WallMotion
 from .motion.wall_points import WallPoints, WallSampler, wall_points
+from .recordings.checks import findings
 from .recordings.errors import RecordingError
+from .recordings.finding import Finding
 from .recordings.read import read_recording
 from .recordings.recording import Recording, Wall
 from .recordings.rules import check_recording
@@ -24,6 +26,7 @@ from .ventricle.ventricle import Beat, Ventricle
 __all__ = [
     "Beat",
     "Closest",
+    "Finding",
     "Grid",
     "GridDistance",
     "MovingDistance",
@@ -47,6 +50,7 @@ __all__ = [
     "distance_and_closest",
     "ellipse",
     "ellipsoid",
+    "findings",
     "grid_winding",
     "labelled",
     "orifices",

@@ -11,7 +11,7 @@ import numpy as np
 from geometry.surfaces.surface import SurfaceError
 
 from .errors import RecordingError
-from .recording import Recording
+from .recording import RULES, Recording
 
 FASTEST = 20.0  # m/s; blood never is as fast, so larger numbers are mm/s or cm/s
 
@@ -40,6 +40,9 @@ def check_recording(recording: Recording, source: str = "recording") -> None:
         _series,
     ):
         rule(recording, source)
+
+
+RULES.append(check_recording)
 
 
 def measured_nodes(recording: Recording) -> np.ndarray:

@@ -24,6 +24,8 @@ from torchsph.methods.frame_splines import smooth as smooth_recording
 from torchsph.methods.runtime import parallel
 
 from .arguments import LEADS
+from .convert import convert
+from .findings import tell_findings
 from .outputs import output_folder, staged, write_json
 
 __all__ = ["COMMANDS"]
@@ -223,7 +225,9 @@ def info(args: argparse.Namespace) -> None:
         ]
         _print_table([["backend", "device", "present", "why"], *rows], text=True)
     if args.file is not None:
-        _print_table(summary_table(geometry.read_recording(args.file)), text=True)
+        recording = geometry.read_recording(args.file)
+        _print_table(summary_table(recording), text=True)
+        tell_findings(recording, args.file, strict=args.strict)
 
 
 def summary_table(recording: geometry.Recording) -> list[list[str]]:
@@ -327,4 +331,5 @@ COMMANDS = {
     "measure": measure,
     "smooth": smooth,
     "info": info,
+    "convert": convert,
 }
