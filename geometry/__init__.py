@@ -4,6 +4,7 @@ from .grids.grid import Grid, Stencil
 from .motion.moving_distance import MovingDistance, WallField, WallPoint
 from .motion.orifices import Orifice, OrificePlane, orifices
 from .motion.refine import refined, refined_motion
+from .motion.wall_estimate import WallEstimate, estimate_wall
 from .motion.wall_motion import WallMotion
 from .motion.wall_points import WallPoints, WallSampler, wall_points
 from .recordings.read import read_recording
@@ -36,6 +37,7 @@ __all__ = [
     "SurfaceIndex",
     "Ventricle",
     "Wall",
+    "WallEstimate",
     "WallField",
     "WallMotion",
     "WallPoint",
@@ -45,6 +47,7 @@ __all__ = [
     "distance_and_closest",
     "ellipse",
     "ellipsoid",
+    "estimate_wall",
     "grid_winding",
     "labelled",
     "orifices",
