@@ -4,6 +4,7 @@ from .grids.grid import Grid, Stencil
 from .motion.moving_distance import MovingDistance, WallField, WallPoint
 from .motion.orifices import Orifice, OrificePlane, orifices
 from .motion.refine import refined, refined_motion
+from .motion.valve_times import ValveTimes, find_valve_times
 from .motion.wall_estimate import WallEstimate, estimate_wall
 from .motion.wall_motion import WallMotion
 from .motion.wall_points import WallPoints, WallSampler, wall_points
@@ -35,6 +36,7 @@ __all__ = [
     "Surface",
     "SurfaceError",
     "SurfaceIndex",
+    "ValveTimes",
     "Ventricle",
     "Wall",
     "WallEstimate",
@@ -48,6 +50,7 @@ __all__ = [
     "ellipse",
     "ellipsoid",
     "estimate_wall",
+    "find_valve_times",
     "grid_winding",
     "labelled",
     "orifices",
