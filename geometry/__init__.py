@@ -15,6 +15,7 @@ from .recordings.write import write_recording
 from .surfaces.closest import Closest, SurfaceIndex
 from .surfaces.distance import GridDistance, distance_and_closest, signed_distance
 from .surfaces.files import labelled, read_surface, write_surface
+from .surfaces.openings import Opening, openings, with_lids
 from .surfaces.repair import repaired
 from .surfaces.segmentation import surface_from_mask, surface_from_points, surface_from_velocity, taubin
 from .surfaces.shapes import box, ellipse, ellipsoid, polygon, revolved, tube
@@ -28,6 +29,7 @@ __all__ = [
     "Grid",
     "GridDistance",
     "MovingDistance",
+    "Opening",
     "Orifice",
     "OrificePlane",
     "Recording",
@@ -53,6 +55,7 @@ __all__ = [
     "find_valve_times",
     "grid_winding",
     "labelled",
+    "openings",
     "orifices",
     "polygon",
     "read_recording",
@@ -69,6 +72,7 @@ __all__ = [
     "tube",
     "wall_points",
     "winding_number",
+    "with_lids",
     "write_recording",
     "write_surface",
 ]

@@ -3,8 +3,8 @@
     python examples/benchmarks/robustness.py TRUTH.h5 MEASURED.h5 [--case NAME ...] [--seed 0] [--json FILE]
 
 One row per case of ``damage.CASES``: NRMSE over the truth's mask of the measurement, of the weighted Gaussian (3 mm
-full width at half maximum), of splines and of the ensemble, all settings the command line's own; ratios beside them. The
-results file is updated case by case, so that a run can be resumed or done in parts.
+full width at half maximum), of splines and of the ensemble, all settings the command line's own; ratios beside them.
+The results file is updated case by case, so that a run can be resumed or done in parts.
 """
 
 from __future__ import annotations

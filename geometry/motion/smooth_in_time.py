@@ -2,8 +2,8 @@
 
 A series is y(t_k) = f(t_k) + noise, f a polynomial of degree below ``ORDER`` (periodic: a constant) plus a Gaussian
 process whose mean given the data is the smoothing spline that penalises the square of the ORDER-th derivative
-(G. Wahba, "Spline Models for Observational Data", SIAM 1990, sections 1.3, 2.1 and 5.1). Noise and process variance are those of
-largest restricted likelihood (section 4.8).
+(G. Wahba, "Spline Models for Observational Data", SIAM 1990, sections 1.3, 2.1 and 5.1). Noise and process variance are
+those of largest restricted likelihood (section 4.8).
 """
 
 from __future__ import annotations

@@ -73,8 +73,8 @@ class WallEstimate:
         """One sentence for a person: how far the given volume jitters."""
         return (
             f"the walls' volume jitters by {1e6 * self.volume_jitter:.3g} ml between frames, "
-            f"{self.relative_jitter:.2g} times what its trend explains in dV/dt; a smooth motion is used (noise {1e3 * self.noise:.2g} mm, left "
-            f"{1e3 * float(np.sqrt((self.sigma**2).mean())):.2g} mm)"
+            f"{self.relative_jitter:.2g} times what its trend explains in dV/dt; a smooth motion is used "
+            f"(noise {1e3 * self.noise:.2g} mm, left {1e3 * float(np.sqrt((self.sigma**2).mean())):.2g} mm)"
         )
 
 

@@ -1,4 +1,4 @@
-"""Valve times from the walls' volume and the flow beside the openings; what a file says is mended where it cannot be."""
+"""Valve times from the walls' volume and the flow beside the openings; what cannot be is mended."""
 
 from dataclasses import replace
 
@@ -23,7 +23,7 @@ def rate_at(time):
 
 
 def box_with_openings(regions, velocity=None, intervals=None, noise=0.0):
-    """A box of 20 mm whose height changes; openings `regions` (quarters of the lid), flow `velocity(label, time)` out."""
+    """A box of 20 mm whose height changes; openings `regions` (quarters of the lid), with `velocity(label, time)` out."""
     box = geometry.box((0, 0, 0), (0.02, 0.02, 0.02), 0.0025)
     fine = np.linspace(0, 0.8, 8001)
     height = 1 + np.concatenate([[0], np.cumsum(0.5 * (rate_at(fine[1:]) + rate_at(fine[:-1])) * np.diff(fine))])
