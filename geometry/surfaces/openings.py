@@ -140,6 +140,6 @@ def _check_lid(rim: np.ndarray, opening: Opening) -> None:
     fan = float(np.linalg.norm(0.5 * np.cross(rim - opening.centre, following - opening.centre), axis=1).sum())
     if fan > _LARGEST_BEND * opening.area:
         raise SurfaceError(
-            f"the rim at {np.round(opening.centre, 4).tolist()} m cannot be closed by a lid: it is bent so far that the "
-            "lid would cut through the blood; cut the surface along a plane there, or mend the wall"
+            f"the rim at {np.round(opening.centre, 4).tolist()} m cannot be closed by a lid: it is bent so far that "
+            "the lid would cut through the blood; cut the surface along a plane there, or mend the wall"
         )
