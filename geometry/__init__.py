@@ -4,6 +4,8 @@ from .grids.grid import Grid, Stencil
 from .motion.moving_distance import MovingDistance, WallField, WallPoint
 from .motion.orifices import Orifice, OrificePlane, orifices
 from .motion.refine import refined, refined_motion
+from .motion.valve_times import ValveTimes, find_valve_times
+from .motion.wall_estimate import WallEstimate, estimate_wall
 from .motion.wall_motion import WallMotion
 from .motion.wall_points import WallPoints, WallSampler, wall_points
 from .recordings.checks import findings
@@ -16,6 +18,7 @@ from .recordings.write import write_recording
 from .surfaces.closest import Closest, SurfaceIndex
 from .surfaces.distance import GridDistance, distance_and_closest, signed_distance
 from .surfaces.files import labelled, read_surface, write_surface
+from .surfaces.openings import Opening, openings, with_lids
 from .surfaces.repair import repaired
 from .surfaces.segmentation import surface_from_mask, surface_from_points, surface_from_velocity, taubin
 from .surfaces.shapes import box, ellipse, ellipsoid, polygon, revolved, tube
@@ -30,6 +33,7 @@ __all__ = [
     "Grid",
     "GridDistance",
     "MovingDistance",
+    "Opening",
     "Orifice",
     "OrificePlane",
     "Recording",
@@ -38,8 +42,10 @@ __all__ = [
     "Surface",
     "SurfaceError",
     "SurfaceIndex",
+    "ValveTimes",
     "Ventricle",
     "Wall",
+    "WallEstimate",
     "WallField",
     "WallMotion",
     "WallPoint",
@@ -50,9 +56,12 @@ __all__ = [
     "distance_and_closest",
     "ellipse",
     "ellipsoid",
+    "estimate_wall",
+    "find_valve_times",
     "findings",
     "grid_winding",
     "labelled",
+    "openings",
     "orifices",
     "polygon",
     "read_recording",
@@ -69,6 +78,7 @@ __all__ = [
     "tube",
     "wall_points",
     "winding_number",
+    "with_lids",
     "write_recording",
     "write_surface",
 ]
