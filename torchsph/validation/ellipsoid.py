@@ -10,7 +10,8 @@ from scipy.special import eval_legendre
 
 import geometry
 from torchsph.simulator.scene import Fluid, Scene, Valve
-from torchsph.simulator.schemes.presets import Scheme, preset
+from torchsph.simulator.schemes.presets import preset
+from torchsph.simulator.schemes.scheme import Scheme
 from torchsph.simulator.schemes.wall_models import CompleteKernelWall
 from torchsph.simulator.simulation import Simulation
 from torchsph.simulator.simulator import Simulator

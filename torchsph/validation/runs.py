@@ -12,7 +12,7 @@ import geometry
 from torchsph.pairs import backend as choose_backend
 from torchsph.pairs.moving_least_squares import fetch_at
 from torchsph.simulator.scene import Fluid, Scene
-from torchsph.simulator.schemes.presets import Scheme
+from torchsph.simulator.schemes.scheme import Scheme
 from torchsph.simulator.schemes.weakly_compressible import WeaklyCompressible
 from torchsph.simulator.seeding import Seeding
 from torchsph.simulator.simulation import Simulation
@@ -55,8 +55,9 @@ def taylor_green(
         pressure = validation.taylor_green_2d_pressure(points, 0.0, 1 / reynolds)
     else:
         velocity, pressure = validation.taylor_green_3d(points), validation.taylor_green_3d_pressure(points)
-    # an incompressible fluid finds its pressure by itself
-    deviation = torch.zeros_like(pressure) if scheme.sound_speed is None else pressure / scheme.sound_speed**2
+    deviation = torch.zeros_like(pressure)
+    if isinstance(scheme, WeaklyCompressible):  # an incompressible fluid finds its pressure by itself
+        deviation = pressure / scheme.sound_speed**2
     run.particles = run.particles.changed(velocity=velocity, deviation=deviation)
     return run
 

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from ..scene import Fluid
-from ..schemes.projection import Projection
-from ..schemes.weakly_compressible import GammaRamp, WeaklyCompressible
+from ..schemes.parts import GammaRamp
+from ..schemes.scheme import Scheme
 from ..state.units import Units
 
 # parameters that a scheme cannot do without; the others are switched off by None
@@ -52,10 +52,10 @@ class Parameters:
     valve_strength: float | Tensor = 1.0
 
     @classmethod
-    def of(cls, scheme: WeaklyCompressible | Projection, fluid: Fluid) -> Parameters:
+    def of(cls, scheme: Scheme, fluid: Fluid) -> Parameters:
         """What a scheme and a fluid say."""
         others = ("xsph", "viscosity", "valve_strength")
-        given = {f.name: getattr(scheme, f.name) for f in fields(cls) if f.name not in others}
+        given = {f.name: getattr(scheme, f.name, None) for f in fields(cls) if f.name not in others}
         return cls(
             **given,
             xsph=None if scheme.xsph is None else scheme.xsph.epsilon,
