@@ -26,6 +26,7 @@ from torchsph.methods.runtime import parallel
 
 from .arguments import LEADS
 from .outputs import output_folder, staged, write_json
+from .quantify import quantify
 
 __all__ = ["COMMANDS"]
 
@@ -327,5 +328,6 @@ COMMANDS = {
     "forecast": forecast,
     "measure": measure,
     "smooth": smooth,
+    "quantify": quantify,
     "info": info,
 }

@@ -1,7 +1,7 @@
 """All scalars of a flow over its frames, for one field or for many members side by side.
 
 Frame by frame: what depends on the mask and the walls alone (derivative operators, pressure equations, orifices) is
-made once and serves all members, whose fields are read one frame at a time, so that a stack on disk is never held whole.
+made once and serves all members, whose fields are read a few frames at a time: a stack on disk is never held whole.
 """
 
 from __future__ import annotations
