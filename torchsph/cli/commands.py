@@ -27,6 +27,7 @@ from .arguments import LEADS
 from .convert import convert
 from .findings import tell_findings
 from .outputs import output_folder, staged, write_json
+from .quantify import quantify
 
 __all__ = ["COMMANDS"]
 
@@ -330,6 +331,7 @@ COMMANDS = {
     "forecast": forecast,
     "measure": measure,
     "smooth": smooth,
+    "quantify": quantify,
     "info": info,
     "convert": convert,
 }

@@ -35,7 +35,7 @@ def difference_weights(times: ArrayLike, at: float) -> Array:
     wanted = np.zeros(len(offsets))
     if len(offsets) > 1:
         wanted[1] = 1 / scale
-    return np.linalg.solve(powers, wanted)
+    return np.asarray(np.linalg.solve(powers, wanted), np.float64)
 
 
 def time_derivative(

@@ -123,7 +123,7 @@ class Derivatives:
         padded = np.pad(number.reshape(self.grid.shape), 1, constant_values=-1)
         index = np.stack(np.unravel_index(self.nodes, self.grid.shape)) + 1
         before, after = (self._neighbours(padded, index, step) for step in (-1, 1))
-        inside = ((before >= 0) & (after >= 0)).all(0)
+        inside = np.all((before >= 0) & (after >= 0), axis=0)
         border = _border_rows(self, np.flatnonzero(~inside))
         return self._assembled(inside, before, after, border)
 

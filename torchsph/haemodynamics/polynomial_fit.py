@@ -95,7 +95,7 @@ def _solve(columns: Array, weight: Array, pseudo: bool = False) -> tuple[Array, 
     values, vectors = np.linalg.eigh(normal)
     large = values > DETERMINED * values[:, -1:]
     inverse = np.where(large, 1 / np.where(large, values, 1.0), 0.0)
-    determined = large.all(1)
+    determined = np.all(large, axis=1)
     if not pseudo:
         inverse = inverse * determined[:, None]
     solution = (vectors * inverse[:, None, :]) @ (np.swapaxes(vectors, 1, 2) @ np.swapaxes(weighted, 1, 2))

@@ -1,7 +1,7 @@
 """All scalars of a flow over its frames, for one field or for many members side by side.
 
 Frame by frame: what depends on the mask and the walls alone (derivative operators, pressure equations, orifices) is
-made once and serves all members, whose fields are read one frame at a time: a stack on disk is never held whole.
+made once and serves all members, whose fields are read a few frames at a time: a stack on disk is never held whole.
 """
 
 from __future__ import annotations
@@ -112,7 +112,7 @@ def long_axis(surface: geometry.Surface) -> tuple[Array, Array]:
 
 
 def flow_quantities(
-    domain: FlowDomain, velocity: ArrayLike, *, sigma: ArrayLike | None = None, order: int = 2
+    domain: FlowDomain, velocity: NDArray[np.floating], *, sigma: ArrayLike | None = None, order: int = 2
 ) -> dict[str, Array]:
     """Every quantity of `UNITS` over time: `(*batch, T)`.
 
@@ -141,7 +141,7 @@ def flow_quantities(
 
 def _frame(
     domain: FlowDomain,
-    velocity: ArrayLike,
+    velocity: NDArray[np.floating],
     number: int,
     sampler: geometry.WallSampler,
     sigma: Array | None,
@@ -185,11 +185,11 @@ def _frame(
     }
 
 
-def _frames_of(velocity: ArrayLike, frames: Sequence[int]) -> Array:
+def _frames_of(velocity: NDArray[np.floating], frames: Sequence[int]) -> Array:
     """Some frames as `(frames, *batch, D, *shape)`, what is not finite as 0."""
     part = slice(frames[0], frames[-1] + 1)
     shape = np.shape(velocity)
-    chosen = velocity[:, part] if len(shape) == 6 else velocity[part]  # type: ignore[index]
+    chosen = velocity[:, part] if len(shape) == 6 else velocity[part]
     array = np.nan_to_num(np.asarray(chosen, np.float64), posinf=0.0, neginf=0.0)
     return np.moveaxis(array, 1, 0) if len(shape) == 6 else array
 

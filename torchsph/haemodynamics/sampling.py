@@ -121,20 +121,19 @@ def plane_section(
     reach = float(np.linalg.norm(corners - middle, axis=1).max())
     step = 0.5 * min(grid.spacing) if pixel is None else pixel
     count = int(np.ceil((reach if radius is None else radius) / step))
-    ticks = step * (np.arange(-count, count) + 0.5)
+    ticks = np.asarray(step * (np.arange(-count, count) + 0.5), np.float64)
     section = PlaneSection(middle, first, second, ticks, ticks, np.ones((2 * count, 2 * count), bool))
     _, share = sample_in_mask(grid, np.zeros(grid.shape), mask, section.points)
     inside = (share >= HALF).reshape(2 * count, 2 * count)
     if radius is not None:
         inside &= ticks[:, None] ** 2 + ticks[None, :] ** 2 <= radius**2
-    rows, columns = inside.any(1), inside.any(0)
-    rows[:2] = columns[:2] = True  # at least two pixels each way, so that a pixel has a size
-    low_t, high_t = _ends(rows if inside.any() else rows[:2])
-    low_s, high_s = _ends(columns if inside.any() else columns[:2])
-    cut = inside[low_t:high_t, low_s:high_s]
-    return PlaneSection(middle, first, second, ticks[low_s:high_s], ticks[low_t:high_t], cut)
+    t, s = _used(np.any(inside, axis=1)), _used(np.any(inside, axis=0))
+    return PlaneSection(middle, first, second, ticks[s], ticks[t], inside[t, s])
 
 
-def _ends(used: NDArray[np.bool_]) -> tuple[int, int]:
-    found = np.flatnonzero(used)
-    return int(found[0]), int(found[-1]) + 1
+def _used(pixels: NDArray[np.bool_]) -> slice:
+    """From the first to the last pixel in use; at least two, so that a pixel has a size."""
+    found = np.flatnonzero(pixels)
+    first, last = (int(found[0]), int(found[-1])) if len(found) else (0, 1)
+    first = min(first, len(pixels) - 2)
+    return slice(first, max(last, first + 1) + 1)

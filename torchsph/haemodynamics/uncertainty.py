@@ -3,8 +3,8 @@
 Members are fields that the truth might be (an ensemble around its control, draws from a spline's posterior). A quantity
 is computed on each of them and only then summarised: of the mean field everything quadratic comes out too small.
 
-`anomalies` of an ensemble around a control that is not its mean: member_m = control + (x_m - mean). With few members
-the 5 and 95 % quantiles of a sample lie too far inside; `summary` therefore takes those of Student's distribution with the
+An ensemble around a control that is not its mean gives control + (x_m - mean): `around`. With few members the 5 and
+95 % quantiles of a sample lie too far inside; `summary` therefore takes those of Student's distribution with the
 sample's mean and deviation, which hold the right share for a normal quantity at any number of members (Wilks 2011, sec.
 5.2): mean +- t(.95, M - 1) s sqrt(1 + 1 / M).
 """

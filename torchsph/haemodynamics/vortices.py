@@ -129,10 +129,10 @@ def main_vortex(gradient: ArrayLike, section: PlaneSection) -> PlaneVortex | Non
     intensity = float(strengths[np.argmax(np.abs(strengths))])
     weight = np.abs(curl) * chosen
     centre = np.array([(weight * section.s).sum(), (weight * section.t[:, None]).sum()]) / weight.sum()
-    low, high = _extent(section.t, section.inside.any(1))
-    left, right = _extent(section.s, section.inside.any(0))
-    bottom, top = _extent(section.t, chosen.any(1))
-    first, last = _extent(section.s, chosen.any(0))
+    low, high = _extent(section.t, np.any(section.inside, axis=1))
+    left, right = _extent(section.s, np.any(section.inside, axis=0))
+    bottom, top = _extent(section.t, np.any(chosen, axis=1))
+    first, last = _extent(section.s, np.any(chosen, axis=0))
     return PlaneVortex(
         centre,
         float(chosen.sum() / section.inside.sum()),

@@ -75,10 +75,10 @@ def lambda2(gradient: ArrayLike) -> Array:
     tensor, dimension = tensor_axes(gradient)
     strain, spin = _parts(tensor)
     both = strain @ strain + spin @ spin
-    values = np.linalg.eigvalsh(both)
+    values = np.asarray(np.linalg.eigvalsh(both), np.float64)
     if dimension == 2:
         values = np.sort(np.concatenate([values, np.zeros_like(values[..., :1])], axis=-1), axis=-1)
-    return values[..., 1]
+    return np.asarray(values[..., 1], np.float64)
 
 
 def _parts(tensor: Array) -> tuple[Array, Array]:
