@@ -204,6 +204,11 @@ class PresentSurroundings:
         particles = domain.valves.opened(particles, self.clock)
         points = domain.valves.imposing_points(particles, self.clock)
         particles = particles.changed(velocity=self._sampled(particles, grid, fields, points))
+        splits = domain.valves.split_points(self.clock)
+        if splits is not None:
+            at = [grid.sample(field, splits * domain.units.length).T for field in fields]
+            read = torch.stack(at) / domain.units.speed
+            domain.valves.note_split(read.expand(particles.members, -1, -1), self.clock)
         return domain.valves.driven(particles, self.clock, channel=True)
 
     def _walls_in_metres(self, points: Tensor) -> tuple[Tensor, Tensor]:
