@@ -4,7 +4,6 @@ An SPH simulator, incompressible or weakly compressible, is the forecast model, 
 and an ensemble filter joins forecasts and measurements.
 """
 
-from ._version import __version__
 from .methods.by_name import DEFAULT_METHOD, METHODS, MethodResult, forecast_skill, make_model, run_methods
 from .methods.ensemble.assimilate import EnsembleRun, assimilate, default_filter
 from .methods.ensemble.options import EnsembleOptions, Estimated
@@ -26,6 +25,8 @@ from .simulator.schemes.weakly_compressible import WeaklyCompressible
 from .simulator.seeding import Seeding
 from .simulator.simulation import Simulation
 from .simulator.simulator import Simulator
+
+__version__ = "0.1.0"  # the one place: pyproject.toml reads it from here, without importing
 
 __all__ = [
     "DEFAULT_METHOD",

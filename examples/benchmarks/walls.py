@@ -169,12 +169,12 @@ def fields(repeats: int) -> dict[str, float]:
     for name, closest in (("compiled", wall_closest.closest_on_grid), ("k-d tree", wall_closest.closest_by_tree)):
         made = WallFields(motion, 1e-3, 1.0, kernel("wendland_c2"), 1.3, True, "cpu", torch.float32)
         made.key(0, ())
-        moments = range(1, len(made.moments.times))
+        numbers = range(1, len(made.key_times.times))
         with mock.patch("torchsph.simulator.walls.fields.closest_on_grid", closest):
             began = time.process_time()
-            for moment in moments:
-                made.key(moment, ())
-            result[name] = (time.process_time() - began) / len(moments)
+            for number in numbers:
+                made.key(number, ())
+            result[name] = (time.process_time() - began) / len(numbers)
         result["nodes"] = made.grid.size
     return result
 

@@ -52,7 +52,7 @@ class AdvancingRun:
         self.surroundings, self._backend = PresentSurroundings(domain), backend
         scene, scheme = domain.scene, domain.scheme
         self.record = Record(particles.members, len(scene.valves), particles.position.device)
-        self.parameters = Parameters.of(scheme, scene.fluid)
+        self.parameters = Parameters.of(scheme, scene.fluid.viscosity)
         self._coefficients = Coefficients.of(self.parameters, self.units, scene.fluid.density)
         # incompressible steps see their neighbours once; lists of that moment also make them independent of a batch
         margin = _SEARCH_MARGIN if scheme.compressible else 0.0

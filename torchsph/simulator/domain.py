@@ -66,7 +66,7 @@ class Domain:
             self.units,
             self.support_radius,
             self.scheme.compressible,
-            walls.moments.wrapped,
+            walls.key_times.wrapped,
             self.period,
             self.device,
             self.dtype,
@@ -141,7 +141,7 @@ class Domain:
         """The times (s) in (start, stop] at which members meet: key frames, valve events, and ``stop``."""
         times = {stop}
         if self.walls is not None:
-            times.update(self.walls.moments.within(start, stop))
+            times.update(self.walls.key_times.within(start, stop))
         if self.scheme.valve is not None:
             times.update(t for valve in self.scene.valves for t in valve.events(start, stop))
         tolerance = 1e-9 * max(1.0, abs(stop))
@@ -170,7 +170,7 @@ class Domain:
         """
         if self.walls is None:
             raise ValueError("a scene without walls has no wall fields")
-        early, late, start, stop = self.walls.moments.bracket(time)
+        early, late, start, stop = self.walls.key_times.bracket(time)
         return (start, stop), (self.walls.key(early, open_regions), self.walls.key(late, open_regions))
 
     def gravity(self, particles: Particles, times: Tensor) -> Tensor | None:

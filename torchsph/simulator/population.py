@@ -21,6 +21,7 @@ from .schemes.population_control import PopulationControl
 from .state.particles import FLUID, Particles
 from .state.record import Record
 from .surroundings import PresentSurroundings
+from .walls.interface import CompleteWallSample
 
 # beyond a free surface there is nothing to seed
 _UNFILLED = "population control needs fluid that fills its walls or its box; it fills {filling}"
@@ -174,20 +175,21 @@ class Population:
             index.insert(0, left % counts[axis])
             left = left // counts[axis]
         centre = origin + (torch.stack(index, 1).to(origin.dtype) + 0.5) * size
-        share = torch.ones_like(centre[:, 0])
+        completeness = torch.ones_like(centre[:, 0])
         fit = torch.ones_like(number, dtype=torch.bool)
         if self.domain.walls is not None and number.numel():
             wall = self._surroundings.sample_at(centre)
-            # without the kernel's share the sum means nothing where walls cut the kernel
-            clear = _CLEARANCE if wall.share is not None else self._support.radius
+            # without the kernel's completeness the sum means nothing where walls cut the kernel
+            complete = isinstance(wall, CompleteWallSample)
+            clear = _CLEARANCE if complete else self._support.radius
             fit = (wall.distance > clear) & ~self._surroundings.beyond_valves(centre)
-            share = share if wall.share is None else wall.share
+            completeness = wall.completeness if complete else completeness
         member, which = torch.nonzero(empty[:, number[fit]], as_tuple=True)
-        centre, share = centre[fit][which], share[fit][which]
+        centre, completeness = centre[fit][which], completeness[fit][which]
         if not member.numel():
             return centre, member
         covered = self._sums(particles, particles.mass[:, None], centre, member).value
-        hole = covered < share * (1.0 - self.options.missing * self._peak)
+        hole = covered < completeness * (1.0 - self.options.missing * self._peak)
         return centre[hole], member[hole]
 
     def _sums(self, particles: Particles, fields: Tensor, place: Tensor, member: Tensor) -> Moments:

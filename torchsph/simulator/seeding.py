@@ -18,7 +18,8 @@ from .state.neighbour_list import PairSearch
 from .state.particles import FLUID, Particles
 from .stepping.pressure import Neighbourhood, packing
 from .surroundings import PresentSurroundings
-from .walls.forces import potential
+from .walls.interface import complete_sample
+from .walls.potential import potential
 
 _TRIES = 200
 _LARGEST_MOVE = 0.1
@@ -33,9 +34,9 @@ class Seeding:
 
     Attributes:
         kind: "boltzmann": random positions accepted with exp(-(U - U0) / T) (section 3.1.4 and its erratum);
-            "quiet": a lattice cut by the walls, then relaxed until the crowding gradient is small.
+            "quiet": a lattice cut by the walls, then relaxed until the concentration gradient is small.
         temperature: T in units of the wall potential at d = 0 (boltzmann).
-        relaxations: sweeps of the quiet start that move particles down the gradient of their crowding.
+        relaxations: sweeps of the quiet start that move particles down the gradient of their concentration.
         packings: solves after them that even out the number density (``projection.packing``), open valves included.
         jitter: random displacement of lattice points, in spacings (quiet).
     """
@@ -195,7 +196,7 @@ def _boltzmann(surroundings: PresentSurroundings, seeding: Seeding, generator: t
 
 
 def _quiet(surroundings: PresentSurroundings, backend: Backend, seeding: Seeding, generator: torch.Generator) -> Tensor:
-    """A lattice inside the walls, relaxed by shifting down the crowding gradient (Colagrossi et al. 2012)."""
+    """A lattice inside the walls, relaxed by shifting down the concentration gradient (Colagrossi et al. 2012)."""
     domain, (lower, upper) = surroundings.domain, _wall_box(surroundings)
     # centred: rows at uneven distances from opposite walls are a density gradient that no wall model can undo
     size = torch.ceil(upper - lower - 1e-3)
@@ -213,15 +214,15 @@ def _quiet(surroundings: PresentSurroundings, backend: Backend, seeding: Seeding
 
 
 def relaxed(surroundings: PresentSurroundings, backend: Backend, position: Tensor, mass: float, sweeps: int) -> Tensor:
-    """Move particles of volume ``mass`` (internal) down the gradient of their crowding, kept off the walls."""
+    """Move particles of volume ``mass`` (internal) down the gradient of their concentration, kept off the walls."""
     support, search = _neighbours(surroundings.domain, backend)
     for _ in range(sweeps):
         particles = _resting(position, torch.full_like(position[:, 0], mass))
         state = particles.state(particles.deviation)
         terms = RateTerms(continuity=None, concentration=True)
-        crowding = search.backend.rates(search.at(particles), state, support, terms).concentration
+        gradient = search.backend.rates(search.at(particles), state, support, terms).concentration
         wall = surroundings.sample_at(position)
-        move = -0.15 * support.length**2 * (crowding - wall.share_gradient)
+        move = -0.15 * support.length**2 * (gradient - complete_sample(wall).completeness_gradient)
         length = move.norm(dim=1, keepdim=True)
         position = position + move * (_LARGEST_MOVE / length.clamp_min(_LARGEST_MOVE))
         wall = surroundings.sample_at(position)

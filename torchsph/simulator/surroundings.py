@@ -16,7 +16,7 @@ from .state.particles import Particles
 from .state.record import Record
 from .transfer.imposing import fill_beyond
 from .walls.compiled import near_wall
-from .walls.forces import WallSample
+from .walls.interface import WallSample
 from .walls.look_up import LookUp
 
 # a particle this far beyond a wall (spacings) counts as outside; the soft potential is meant to be entered a little
@@ -103,7 +103,7 @@ class PresentSurroundings:
             return gravity if self.valve_acceleration is None else self.valve_acceleration
         return gravity + self.valve_acceleration
 
-    def shortfall(self, particles: Particles) -> Tensor:
+    def volume_deficit_rate(self, particles: Particles) -> Tensor:
         """By how much (N,), per time, the volume of a member's particles should grow to fill the cavity."""
         return per_particle(self.domain.valves.volume_deficit_rate(particles, self.clock), particles.member)
 
@@ -204,6 +204,11 @@ class PresentSurroundings:
         particles = domain.valves.opened(particles, self.clock)
         points = domain.valves.imposing_points(particles, self.clock)
         particles = particles.changed(velocity=self._sampled(particles, grid, fields, points))
+        splits = domain.valves.split_points(self.clock)
+        if splits is not None:
+            at = [grid.sample(field, splits * domain.units.length).T for field in fields]
+            read = torch.stack(at) / domain.units.speed
+            domain.valves.note_split(read.expand(particles.members, -1, -1), self.clock)
         return domain.valves.driven(particles, self.clock, channel=True)
 
     def _walls_in_metres(self, points: Tensor) -> tuple[Tensor, Tensor]:

@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from torchsph.pairs.vectors import inner, per_particle, square_length
+from torchsph.pairs.vectors import per_particle
 
 from .domain import Domain
-from .schemes.wall_models import PotentialWall
 from .state.particles import Particles
 from .state.record import Record
-from .walls.forces import WallSample, friction_rate, potential_force, retardation
+from .walls.interface import FluidAtWalls, WallSample
+from .walls.registry import wall_forces
 
 if TYPE_CHECKING:
     from .stepping.protocols import Stepper
@@ -27,14 +27,14 @@ class WorkAccount:
     """Adds the work of each step to a record.
 
     Pressure does the work  int p v_wall . n dA,  as a sum over the particles whose kernels the wall cuts: the kernel's
-    integral over the wall is the gradient of its share inside (Ferrand et al. 2013), and half of a kernel centred on a
+    integral over the wall is the gradient of its completeness (Ferrand et al. 2013), and half of a kernel centred on a
     plane wall lies inside. Where the wall is curved or folded that half is off by the curvature over a kernel's radius.
     A potential wall does the work of the force and the retardation that particles feel. What walls do to particles that
     they stop outright is added where that happens (``Domain.constrain``).
     """
 
     def __init__(self, domain: Domain, record: Record) -> None:
-        self._record, self._wall = record, domain.scheme.wall
+        self._record, self._walls = record, wall_forces(domain.scheme.wall)
         self._moving = domain.walls is not None and bool(domain.walls.motion.rates_at_keys.any())
         self._unit = domain.energy_unit
 
@@ -86,18 +86,12 @@ class WorkAccount:
     ) -> Tensor:
         """Power per mass (N,) of the walls on the particles, internal; few passes, because every step pays for them."""
         c = stepper.coefficients
-        if isinstance(self._wall, PotentialWall):
-            sound = per_particle(c.sound_speed, stepped.member)
-            force = potential_force(self._wall, sound, wall)
-            if self._wall.relaxation is not None:
-                # a step backwards from where it has led gives what it has changed
-                dt = per_particle(step, stepped.member)
-                change = stepped.velocity - retardation(self._wall, sound, -dt, stepped.velocity, wall)
-                force = force + change / dt.clamp_min(torch.finfo(dt.dtype).tiny)[:, None]
-            return inner(force, wall.velocity)
-        swept = inner(wall.velocity, wall.share_gradient) if wall.swept is None else wall.swept
-        power = 2.0 * stepper.pressure(stepped) / (1.0 + stepped.deviation) * swept
-        if self._wall.no_slip and c.viscosity is not None:
-            rate = friction_rate(per_particle(c.viscosity, stepped.member), wall)
-            power = power + rate * (square_length(wall.velocity) - inner(before.velocity, wall.velocity))
-        return power
+        fluid = FluidAtWalls(
+            stepped.velocity,
+            stepped.deviation,
+            stepped.member,
+            pressure=stepper.pressure(stepped),
+            sound_speed=c.sound_speed,
+            viscosity=c.viscosity,
+        )
+        return self._walls.power(before.velocity, fluid, wall, per_particle(step, stepped.member))

@@ -2,10 +2,22 @@
 
 from __future__ import annotations
 
+from typing import Protocol
+
 import torch
 from torch import Tensor
 
 from .particles import Particles
+
+
+class Split(Protocol):
+    """What openings that are open together carried when it was last read (``valves.flux_split``)."""
+
+    numbers: tuple[int, ...]
+    flux: Tensor
+
+    def at(self, numbers: tuple[int, ...], areas: Tensor, total: Tensor) -> Tensor:
+        """Fluxes (members, n) of some of the openings that sum to ``total`` (members,)."""
 
 
 class Clock:
@@ -16,10 +28,12 @@ class Clock:
         valve_strength: the run's factor on what drives the flow through open valves, a number or (members,).
         middle: s, of the interval.
         times: () or (members,) float64, s, the present time of all members or of each.
+        flux_split: how openings that are open together share what they pass; None until it is read.
     """
 
     def __init__(self, device: str | torch.device) -> None:
         self._device = device
+        self.flux_split: Split | None = None
         self.enter(0.0, 0.0, (), 1.0)
 
     def enter(self, start: float, stop: float, open_regions: tuple[int, ...], valve_strength: float | Tensor) -> None:

@@ -17,19 +17,21 @@ from ..state.neighbour_list import PairSearch
 from ..state.particles import Particles
 from ..state.required import required
 from ..walls.compiled import complete_rates
-from ..walls.forces import SMALLEST_SHARE, WallSample
+from ..walls.formulas import SMALLEST_COMPLETENESS
+from ..walls.interface import CompleteWallSample, WallSample, complete_sample
 from .connected_parts import components
 
 # densities that a source can react to: what is denser or thinner by more is a fault of another kind
 _LARGEST_EXCESS = 0.3
-_TINY = 1e-6
-# classes of the kernel's share inside the walls, in which particles are compared
+# volumes and lengths are divided by nothing smaller
+_SMALLEST = 1e-6
+# classes of the kernel's completeness, in which particles are compared
 _CLASSES = 16
 # a displacement of more than this (spacings) would outrun the linearisation
-_LARGEST_MOVE = 0.2
+_LONGEST_MOVE = 0.2
 # part of a full kernel's moment below which no slope is drawn from what is left of it
 _SMALLEST_MOMENT = 0.3
-# cosine between the share's gradient and the wall's normal below which a wall is not plain
+# cosine between the completeness's gradient and the wall's normal below which a wall is not plain
 _EDGE = 0.9
 
 
@@ -54,7 +56,7 @@ class Neighbourhood:
         search: neighbour list.
         pairs: neighbours, as the backend's search gave them.
         support: kernel and smoothing length.
-        wall: walls at the particles, of a model with the kernel's share, or None.
+        wall: walls at the particles, of a model that is complete, or None.
     """
 
     particles: Particles
@@ -64,9 +66,19 @@ class Neighbourhood:
     wall: WallSample | None
 
     @cached_property
-    def share(self) -> Tensor | None:
-        """Part of each kernel inside the walls, (N,), at least ``SMALLEST_SHARE``; None without walls."""
-        return None if self.wall is None else self.wall.share.clamp_min(SMALLEST_SHARE)
+    def complete_wall(self) -> CompleteWallSample | None:
+        """Walls at the particles, with the kernel's completeness; None without walls.
+
+        Raises:
+            ValueError: the walls come without it.
+        """
+        return None if self.wall is None else complete_sample(self.wall)
+
+    @cached_property
+    def completeness(self) -> Tensor | None:
+        """Part of each kernel inside the walls, (N,), at least ``SMALLEST_COMPLETENESS``; None without walls."""
+        wall = self.complete_wall
+        return None if wall is None else wall.completeness.clamp_min(SMALLEST_COMPLETENESS)
 
     def rates(self, terms: RateTerms) -> Rates:
         """First-pass sums."""
@@ -76,7 +88,7 @@ class Neighbourhood:
     def filling(self, sums: Rates) -> Tensor:
         """Number density relative to that of particles at rest density, (N,), from Shepard's sum."""
         volume = required(sums.shepard_volume, "Shepard's sum")
-        return volume if self.share is None else volume / self.share
+        return volume if self.completeness is None else volume / self.completeness
 
     def excess(self, filling: Tensor, counted: Tensor) -> Tensor:
         """Filling relative to the mean of the member's particles whose kernel is cut alike by walls, less 1.
@@ -94,16 +106,16 @@ class Neighbourhood:
         """
         p = self.particles
         group = p.member
-        if self.wall is not None:
-            group = group * (_CLASSES + 1) + (self.wall.share * _CLASSES).to(torch.int64)
+        if self.complete_wall is not None:
+            group = group * (_CLASSES + 1) + (self.complete_wall.completeness * _CLASSES).to(torch.int64)
         weight = counted.to(filling.dtype)
         size = p.members * (_CLASSES + 1)
         count = filling.new_zeros(size).index_add(0, group, weight)
         mean = filling.new_zeros(size).index_add(0, group, weight * filling) / count.clamp_min(1.0)
-        excess = (filling / mean[group].clamp_min(_TINY) - 1.0).clamp(-_LARGEST_EXCESS, _LARGEST_EXCESS)
+        excess = (filling / mean[group].clamp_min(_SMALLEST) - 1.0).clamp(-_LARGEST_EXCESS, _LARGEST_EXCESS)
         return torch.where(counted, excess, torch.zeros_like(excess))
 
-    def _wall_jump(self, wall: WallSample) -> Tensor:
+    def _wall_jump(self, wall: CompleteWallSample) -> Tensor:
         """What the divergence at walls lacks, as a source (N,): half of the jump from the fluid's speed to the wall's.
 
         Of a jump at the wall the kernels of the fluid see the half that lies on their side; a wall that accelerates
@@ -112,29 +124,30 @@ class Neighbourhood:
         noise at their edges.
         """
         p = self.particles
-        steep = square_length(wall.share_gradient).sqrt()
+        steep = square_length(wall.completeness_gradient).sqrt()
         terms = MomentumTerms(pressure="difference")
         along = inner(p.velocity, wall.normal)
         fall = self.search.backend.momentum(self.pairs, p.state(along), self.support, terms)
         # the sum's own moment across a plane wall, by the divergence theorem
-        moment = (wall.share - wall.distance * steep).clamp_min(_SMALLEST_MOMENT)
+        moment = (wall.completeness - wall.distance * steep).clamp_min(_SMALLEST_MOMENT)
         rise = -inner(fall, wall.normal) / moment
         jump = inner(wall.velocity, wall.normal) - along + wall.distance.clamp_min(0.0) * rise
         # where walls meet at an edge there is no such line to continue on
-        cosine = inner(wall.share_gradient, wall.normal) / steep.clamp_min(_TINY)
+        cosine = inner(wall.completeness_gradient, wall.normal) / steep.clamp_min(_SMALLEST)
         plain = (cosine - _EDGE).clamp_min(0.0) / (1.0 - _EDGE)
-        return torch.where(p.fluid, plain * jump * steep / wall.share.clamp_min(SMALLEST_SHARE), torch.zeros_like(jump))
+        source = plain * jump * steep / wall.completeness.clamp_min(SMALLEST_COMPLETENESS)
+        return torch.where(p.fluid, source, torch.zeros_like(jump))
 
     def divergence(self, sums: Rates) -> tuple[Tensor, Tensor | None]:
         """Velocity divergence (N,) for the pressure to answer, and the gradient (N, D) of the concentration.
 
         Both are complete at walls; the gradient is None where ``sums`` lack it.
         """
-        wall, divergence = self.wall, required(sums.divergence, "the velocity's divergence")
+        wall, divergence = self.complete_wall, required(sums.divergence, "the velocity's divergence")
+        if wall is None:
+            return divergence, sums.concentration
         divergence, gradient = complete_rates(divergence, sums.concentration, self.particles.velocity, wall)
-        if wall is not None and bool(wall.velocity.any()):
-            divergence = divergence - self._wall_jump(wall)
-        return divergence, gradient
+        return (divergence - self._wall_jump(wall) if bool(wall.velocity.any()) else divergence), gradient
 
     def project(
         self,
@@ -161,7 +174,7 @@ class Neighbourhood:
         p, fluid = self.particles, self.particles.fluid
         coupled = fluid if prescribed is None else fluid | prescribed
         bound = torch.zeros_like(fluid) if surface is None else surface
-        source, fixed = source if self.share is None else source * self.share, None
+        source, fixed = source if self.completeness is None else source * self.completeness, None
         if prescribed is not None:
             bound = bound | prescribed
             fixed = torch.where(prescribed, required(start, "the pressure of the buffers"), torch.zeros_like(source))
@@ -173,9 +186,9 @@ class Neighbourhood:
             found = self._solve_by_parts(problem, found)
         if fixed is not None:
             found = replace(found, values=found.values + fixed)
-        if self.share is not None:
+        if self.completeness is not None:
             volume = torch.where(fluid, p.mass, torch.zeros_like(p.mass)).double()
-            part = p.per_member(volume * self.share, "sum").clamp_min(_TINY)
+            part = p.per_member(volume * self.completeness, "sum").clamp_min(_SMALLEST)
             found = replace(found, mismatch=found.mismatch * p.per_member(volume, "sum") / part)
         return self._descent(found.values, coupled), found
 
@@ -229,7 +242,7 @@ class Neighbourhood:
         mass = p.mass if bool(coupled.all()) else torch.where(coupled, p.mass, torch.zeros_like(p.mass))
         terms = MomentumTerms(pressure="difference")
         slope = self.search.backend.momentum(self.pairs, p.changed(mass=mass).state(potential), self.support, terms)
-        slope = slope if self.share is None else slope / self.share[:, None]
+        slope = slope if self.completeness is None else slope / self.completeness[:, None]
         slope = torch.where(p.fluid[:, None], slope, torch.zeros_like(slope))
         return slope if self.wall is not None else self._without_thrust(slope)
 
@@ -239,7 +252,7 @@ class Neighbourhood:
         The gradient by differences is exact for a constant pressure but, unlike the symmetric one, not antisymmetric.
         """
         p = self.particles
-        mass = p.per_member(p.mass, "sum").clamp_min(_TINY)
+        mass = p.per_member(p.mass, "sum").clamp_min(_SMALLEST)
         total = acceleration.new_zeros((p.members, acceleration.shape[1]))
         thrust = total.index_add(0, p.member, p.mass[:, None] * acceleration)
         return acceleration - (thrust / mass[:, None]).index_select(0, p.member)
@@ -284,4 +297,4 @@ def packing(around: Neighbourhood, *, tolerance: float = 3e-2, iterations: int =
     source = excess.clamp(-_LARGEST_EXCESS, _LARGEST_EXCESS)
     move, _ = around.project(source, None, None, tolerance, iterations)
     length = move.norm(dim=1, keepdim=True)
-    return move * (_LARGEST_MOVE / length.clamp_min(_LARGEST_MOVE)), excess
+    return move * (_LONGEST_MOVE / length.clamp_min(_LONGEST_MOVE)), excess

@@ -16,8 +16,8 @@ from ..schemes.projection import Projection
 from ..state.neighbour_list import PairSearch
 from ..state.particles import Particles
 from ..state.record import Record
-from ..walls.compiled import complete_forces
-from ..walls.forces import WallSample
+from ..walls.interface import FluidAtWalls, WallSample
+from ..walls.registry import wall_forces
 from .coefficients import Coefficients
 from .pressure import Neighbourhood
 from .protocols import Stepped, Surroundings
@@ -41,6 +41,7 @@ class ProjectionStepper:
     ) -> None:
         self.scheme, self.pair_search, self.dimension, self._record = scheme, search, dimension, record
         self.prescribed_kinds: Tensor | None = None  # kinds of the buffers whose pressure is given
+        self._walls = wall_forces(scheme.wall)
         self.use(coefficients)
 
     def use(self, coefficients: Coefficients) -> None:
@@ -155,7 +156,7 @@ class ProjectionStepper:
         """
         drawn = particles.per_member(prescribed.to(torch.int64), "sum") > 0
         drawn = particles.inside & drawn.index_select(0, particles.member)
-        return torch.where(drawn, around.shortfall(particles), torch.zeros_like(particles.mass))
+        return torch.where(drawn, around.volume_deficit_rate(particles), torch.zeros_like(particles.mass))
 
     def _split(self, force: Tensor | None) -> tuple[Tensor | None, Tensor | None]:
         """A body force (N, D) as the part that only adds its potential to the pressure, and the rest; None for nothing.
@@ -179,8 +180,10 @@ class ProjectionStepper:
         backend, state = self.pair_search.backend, particles.state(particles.deviation)
         sums, drag = backend.right_hand_side(surroundings.pairs, state, self.support, self._terms, self._laminar)
         if wall is not None:
-            nu = self.coefficients.viscosity if self.scheme.wall.no_slip else None
-            drag = complete_forces(drag, particles.velocity, wall, viscosity=nu, member=particles.member)
+            fluid = FluidAtWalls(
+                particles.velocity, particles.deviation, particles.member, viscosity=self.coefficients.viscosity
+            )
+            drag = self._walls.accelerate(drag, fluid, wall)
         return sums, drag if force is None else force + drag
 
     @staticmethod

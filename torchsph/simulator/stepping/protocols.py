@@ -10,7 +10,7 @@ from torchsph.pairs.interface import Support
 
 from ..state.neighbour_list import PairSearch
 from ..state.particles import Particles
-from ..walls.forces import WallSample
+from ..walls.interface import WallSample
 from .coefficients import Coefficients
 
 
@@ -23,7 +23,7 @@ class Surroundings(Protocol):
     def body_force(self, particles: Particles) -> Tensor | None:
         """Acceleration (N, D) by gravity and pressure sources, or None."""
 
-    def shortfall(self, particles: Particles) -> Tensor:
+    def volume_deficit_rate(self, particles: Particles) -> Tensor:
         """By how much (N,), per time, the volume of a member's particles should grow to fill the cavity."""
 
     def later(self, particles: Particles, step: Tensor) -> Particles:

@@ -13,13 +13,12 @@ from torchsph.pairs.moving_least_squares import solve_small
 from torchsph.pairs.smoothing_kernels import kernel
 from torchsph.pairs.vectors import column, per_particle
 
-from ..schemes.wall_models import PotentialWall
 from ..schemes.weakly_compressible import WeaklyCompressible
 from ..state.neighbour_list import PairSearch
 from ..state.particles import Particles
 from ..state.required import required
-from ..walls.compiled import complete_forces, complete_rates
-from ..walls.forces import WallSample, potential_force, retardation
+from ..walls.interface import FluidAtWalls, WallSample
+from ..walls.registry import wall_forces
 from .coefficients import Coefficients
 from .density_filter import DensityFilter
 from .protocols import Surroundings
@@ -68,6 +67,7 @@ class WeaklyCompressibleSums:
         self.scheme, self.pair_search, self.dimension, self._buffered = scheme, search, dimension, buffered
         self.prescribed_kinds: Tensor | None = None  # kinds of the buffers whose pressure, and so density, is given
         self.density_filter = DensityFilter.of(scheme)
+        self.walls = wall_forces(scheme.wall)
         self.use(coefficients)
 
     def use(self, coefficients: Coefficients) -> None:
@@ -115,7 +115,9 @@ class WeaklyCompressibleSums:
         divergence = required(sums.divergence, "the velocity's divergence")
         if self.scheme.continuity == "mass":
             divergence = divergence / (1.0 + particles.deviation)  # Grønli 2017, eq. 2.19, is the density's, rho0 = 1
-        divergence, gradient = complete_rates(divergence, sums.concentration, particles.velocity, wall)
+        gradient = sums.concentration
+        if wall is not None:
+            divergence, gradient = self.walls.complete_rates(divergence, gradient, particles.velocity, wall)
         return RateSums(self._density_rate(particles, sums, divergence), divergence, gradient, sums)
 
     def _first_pass(self, particles: Particles, pairs: Any, terms: RateTerms) -> Rates:
@@ -188,20 +190,8 @@ class WeaklyCompressibleSums:
         state = particles.state(pressure)
         acceleration = self.pair_search.backend.momentum(pairs, state, self.support, self._momentum_terms)
         body = around.body_force(particles)
-        if wall is not None and wall.share is not None:
-            acceleration = complete_forces(
-                acceleration,
-                particles.velocity,
-                wall,
-                member=particles.member,
-                form=self.scheme.pressure,
-                viscosity=self.coefficients.viscosity if self.scheme.wall.no_slip else None,
-                pressure=pressure,
-                deviation=particles.deviation,
-            )
-        elif wall is not None and isinstance(self.scheme.wall, PotentialWall):
-            sound = per_particle(self.coefficients.sound, particles.member)
-            acceleration = acceleration + potential_force(self.scheme.wall, sound, wall)
+        if wall is not None:
+            acceleration = self.walls.accelerate(acceleration, self._at_walls(particles, pressure), wall)
         return acceleration if body is None else acceleration + body
 
     def kick(self, particles: Particles, velocity: Tensor, dt: Tensor, acceleration: Tensor) -> Tensor:
@@ -217,12 +207,24 @@ class WeaklyCompressibleSums:
 
     def damp_at_walls(self, particles: Particles, wall: WallSample | None, dt: Tensor) -> Particles:
         """Particles slowed down over ``dt`` (N,) by walls whose friction is no acceleration."""
-        model = self.scheme.wall
-        if wall is None or not isinstance(model, PotentialWall) or model.relaxation is None:
+        if wall is None:
             return particles
-        sound = per_particle(self.coefficients.sound, particles.member)
-        velocity = retardation(model, sound, dt, particles.velocity, wall)
+        velocity = self.walls.damp(self._at_walls(particles), wall, dt)
+        if velocity is particles.velocity:
+            return particles
         return particles.changed(velocity=torch.where(particles.fluid[:, None], velocity, particles.velocity))
+
+    def _at_walls(self, particles: Particles, pressure: Tensor | None = None) -> FluidAtWalls:
+        c = self.coefficients
+        return FluidAtWalls(
+            particles.velocity,
+            particles.deviation,
+            particles.member,
+            form=self.scheme.pressure,
+            pressure=pressure,
+            sound_speed=c.sound_speed,
+            viscosity=c.viscosity,
+        )
 
     def position_correction(self, particles: Particles, rates: RateSums, seen: Particles, step: Tensor) -> Tensor:
         """What moves particles in a step beside their velocity: position XSPH and shifting.

@@ -97,6 +97,13 @@ class ValveModel:
         """Where particles look up a field that is imposed on them, (N, D)."""
         return particles.position
 
+    def split_points(self, clock: Clock) -> Tensor | None:
+        """Points (n, D) where a field that is imposed tells how openings share what they pass, or None."""
+        return None
+
+    def note_split(self, velocity: Tensor, clock: Clock) -> None:
+        """Note how openings share what they pass, from a field (members, n, D) at ``split_points``."""
+
     def pressure_reservoirs(self, backend: Backend) -> PressureReservoirs | None:
         """What drives the buffers of valves with a given pressure, or None without any, so that it costs nothing."""
         return None

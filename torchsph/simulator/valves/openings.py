@@ -16,6 +16,8 @@ from ..state.units import Units
 
 # half the width (spacings) over which what stands over an opening is blended in
 _RIM = 0.5
+# points across the radius of an opening in which its flux is read
+_QUADRATURE = 24
 # opening planes kept in memory, and the part of its area and of a spacing by which an opening may differ from its plane
 _KEPT_PLANES = 64
 _AREA_CHANGE, _PLACE_CHANGE = 0.01, 0.1
@@ -48,6 +50,7 @@ class OpeningPlane:
         self.velocity = tensor(velocity)
         self._outline, self._edges = tensor(plane.outline), torch.from_numpy(plane.edges).to(device)
         self.radius = float(np.linalg.norm(plane.outline, axis=1).max())
+        self._quadrature: Tensor | None = None
         self._clear = float(self.inset(self.centre[None]).clamp_min(0.0))  # nothing of the rim is nearer to the middle
 
     def height(self, position: Tensor) -> Tensor:
@@ -71,6 +74,16 @@ class OpeningPlane:
         height = self.height(position)
         aside = (position - self.centre - height[:, None] * self.normal).norm(dim=1)
         return (height > -0.5) & (aside < self.radius + 1.0)
+
+    def quadrature(self) -> Tensor:
+        """Points evenly over the opening, (n, D), much closer than particles: their mean is the opening's."""
+        if self._quadrature is None:
+            step = self.radius / _QUADRATURE
+            axis = torch.arange(-_QUADRATURE, _QUADRATURE, dtype=self.centre.dtype, device=self.centre.device) + 0.5
+            flat = step * torch.cartesian_prod(*[axis] * self.basis.shape[0]).reshape(-1, self.basis.shape[0])
+            place = self.centre + flat @ self.basis
+            self._quadrature = place[self.inset(place) > 0]
+        return self._quadrature
 
     def lattice(self, length: float) -> Tensor:
         """Unit lattice in the channel of the given length behind the opening, (n, D)."""
@@ -100,6 +113,8 @@ class Openings:
         self.all = [orifice for orifice in orifices(self.motion) if orifice.label in labels]
         self.valve_of = [labels[orifice.label] for orifice in self.all]
         self.given = [n for n, valve in enumerate(self.valve_of) if self.valves[valve].pressure is not None]
+        # m^3/s (m^2/s in a plane) of one internal unit of volume per time
+        self.flux_unit = units.length**self.motion.dimension / units.time
         self._pace = self._resting_time()
         self._planes: dict[tuple[int, int], OpeningPlane] = {}
 

@@ -24,6 +24,7 @@ from ..state.record import Record
 from .accounts import note_passed
 from .buffer_flow import AREA_TRUST, mean_near, scaled_profile, volume_of_rows, with_channel_flux
 from .cavity_volume import CavityVolume
+from .flux_split import FluxSplit, fluxes, takers
 from .model import Pressure, ValveModel, ValveSetting
 from .openings import OpeningPlane, Openings
 from .pressure_reservoirs import PressureReservoirs
@@ -110,32 +111,59 @@ class Reservoirs(ValveModel):
             return torch.zeros_like(times, dtype=self._setting.dtype)
         return self._deficit(particles, times, clock) / (self.volume.volume(times) * self.relaxation)
 
-    def _flux_through(self, number: int, inflow: Tensor, clock: Clock) -> Tensor:
-        """The part of the inflow (members,) that goes through one opening.
+    def _lead(self, number: int, clock: Clock, members: int) -> float | Tensor:
+        """Length of the free channel before the buffer of an opening: 0 where fluid enters in the present interval.
 
-        With several valves open at once the cavity fills through the first and empties through the last of them;
-        openings of one region share by area.
+        One for all members, or (members,) where openings share what they pass: members may differ in its sense.
         """
-        fills, empties = self._passes(number, clock)
-        region = self.openings.all[number].label
-        total = sum(plane.area for n, plane in self.openings.active(clock) if self.openings.all[n].label == region)
-        if not (fills and empties):
-            inflow = inflow.clamp_min(0.0) if fills else inflow.clamp_max(0.0) if empties else torch.zeros_like(inflow)
-        return inflow * (self.openings.plane(number, clock.mean).area / total)
-
-    def _passes(self, number: int, clock: Clock) -> tuple[bool, bool]:
-        """Whether the cavity fills, and whether it empties, through an opening."""
-        given = {self.openings.all[n].label for n in self.openings.given}
-        regions = sorted(set(clock.open_regions) - given)
-        region = self.openings.all[number].label
-        return region == regions[0], region == regions[-1]
-
-    def _lead(self, number: int, clock: Clock) -> float:
-        """Length of the free channel before the buffer of an opening: 0 where fluid enters in the present interval."""
         if not self._run_out or number in self.openings.given:
             return 0.0
-        inflow = self.volume.rate_at(clock.middle)
-        return self._run_out if inflow < 0.0 and self._passes(number, clock)[1] else 0.0
+        shared = (
+            self.openings.valve(number).flux is None and len(takers(self.openings, self.openings.active(clock))) > 1
+        )
+        inflow = torch.full((members if shared else 1,), self.volume.rate_at(clock.middle), dtype=self._setting.dtype)
+        through = fluxes(self.openings, clock, inflow.to(self._setting.device), time=clock.middle)[number]
+        if shared:
+            return torch.where(through < 0.0, self._run_out, 0.0).to(through)
+        return self._run_out if float(through) < 0.0 else 0.0
+
+    def split_points(self, clock: Clock) -> Tensor | None:
+        """Points (n, D) just inside openings that share what they pass, where their fluxes are read; None: none do."""
+        free = takers(self.openings, self.openings.active(clock))
+        if len(free) < 2:
+            return None
+        return torch.cat([plane.quadrature() - _MOUTH * plane.normal for _, plane in free])
+
+    def note_split(self, velocity: Tensor, clock: Clock) -> None:
+        """Read how openings share what they pass off a field (members, n, D) at their ``split_points``."""
+        free = takers(self.openings, self.openings.active(clock))
+        counts = [len(plane.quadrature()) for _, plane in free]
+        read = [
+            -plane.area * ((part - plane.velocity) @ plane.normal).mean(1)
+            for (_, plane), part in zip(free, velocity.split(counts, dim=1), strict=True)
+        ]
+        self._keep_split(torch.stack(read, 1), free, clock)
+
+    def _keep_split(self, read: Tensor, free: list[tuple[int, OpeningPlane]], clock: Clock) -> None:
+        """Keep fluxes (members, n) that were read of some openings, brought to sum to what they pass together."""
+        numbers = tuple(n for n, _ in free)
+        found = fluxes(self.openings, clock, self.volume.rate(clock.of_members(len(read))))
+        total = torch.stack([found[n] for n in numbers]).sum(0)
+        areas = total.new_tensor([plane.area for _, plane in free])
+        clock.flux_split = FluxSplit.balanced(numbers, read, areas, total)
+
+    def _read_buffers(self, particles: Particles, clock: Clock) -> None:
+        """Read how openings share what they pass off the velocities of their buffers, where a run goes on."""
+        free = takers(self.openings, self.openings.active(clock))
+        behind = [(particles.kind == RESERVOIR + n) | (particles.kind == CHANNEL - n) for n, _ in free]
+        if len(free) < 2 or not all(bool(one.any()) for one in behind):
+            return
+        read = []
+        for (_, plane), one in zip(free, behind, strict=True):
+            along = torch.where(one, ((particles.velocity - plane.velocity) * plane.normal).sum(1), 0.0)
+            count = particles.per_member(one.to(along.dtype), "sum").clamp_min(1.0)
+            read.append(-plane.area * particles.per_member(along, "sum") / count)
+        self._keep_split(torch.stack(read, 1), free, clock)
 
     def opened(self, particles: Particles, clock: Clock) -> Particles:
         """Make the buffers of valves that are open and have none, drop those of valves that have shut."""
@@ -144,6 +172,8 @@ class Reservoirs(ValveModel):
             kind = torch.tensor([k for n in gone for k in (RESERVOIR + n, CHANNEL - n)], device=particles.kind.device)
             stay = ~torch.isin(particles.kind, kind)
             particles = particles if bool(stay.all()) else particles.select(stay)
+        if clock.flux_split is None:
+            self._read_buffers(particles, clock)
         for number, plane in self.openings.active(clock):
             has = particles.per_member((particles.kind == RESERVOIR + number).to(torch.int64), "sum") > 0
             empty = torch.nonzero(~has).squeeze(1)
@@ -156,8 +186,11 @@ class Reservoirs(ValveModel):
     ) -> Particles:
         """A fresh lattice in the channel of one valve for some members, its first part free where fluid leaves."""
         place = plane.lattice(self._far)
-        kind = torch.where(plane.height(place) < self._lead(number, clock), CHANNEL - number, RESERVOIR + number)
         count, copies = place.shape[0], members.numel()
+        lead = self._lead(number, clock, particles.members)
+        lead = lead[members].repeat_interleave(count) if isinstance(lead, Tensor) else lead
+        height = plane.height(place).repeat(copies)
+        kind = torch.where(height < lead, CHANNEL - number, RESERVOIR + number)
         # a lattice does not tile an opening: its particles share the channel's volume
         mass = place.new_full((members.numel(),), plane.area * self._far / max(count, 1))
         return Particles(
@@ -166,7 +199,7 @@ class Reservoirs(ValveModel):
             deviation=mean_near(particles, plane, particles.deviation)[members].repeat_interleave(count),
             mass=mass.repeat_interleave(count),
             member=members.repeat_interleave(count),
-            kind=kind.repeat(copies),
+            kind=kind,
             members=particles.members,
         )
 
@@ -179,24 +212,27 @@ class Reservoirs(ValveModel):
         if self.relaxation is not None and not channel and not any(number in given for number, _ in active):
             inflow = inflow + self._deficit(particles, times, clock) / self.relaxation
             particles = self._levelled(particles, clock)
-        velocity = particles.velocity
+        velocity, through = particles.velocity, fluxes(self.openings, clock, inflow)
         for number, plane in active:
             if number in given:
                 continue
             buffer, free = particles.kind == RESERVOIR + number, particles.kind == CHANNEL - number
-            row, lead = torch.nonzero(buffer | free if channel else buffer).squeeze(1), self._lead(number, clock)
+            row = torch.nonzero(buffer | free if channel else buffer).squeeze(1)
+            lead = self._lead(number, clock, particles.members)
             length = self._far if channel else self._far - lead
             owner, old = particles.member[row], velocity[row]
             along = (old * plane.normal).sum(1)
             own = plane.velocity
-            speed = -self._flux_through(number, inflow, clock) / plane.area  # outward
+            speed = -through[number] / plane.area  # outward
             # what enters must be what is wanted, however full the buffer is; what leaves follows the fluid before it
             emptier = (plane.area * length / volume_of_rows(particles, row)).clamp(*AREA_TRUST)
             wanted = torch.where(speed < 0.0, speed * emptier, speed)
             target = scaled_profile(along - (own * plane.normal).sum(), owner, wanted, flat=self._flat)
             new = own + target[:, None] * plane.normal
             velocity = velocity.index_copy(0, row, new)
-            if lead and not channel:
+            if isinstance(lead, Tensor):
+                free = free & (lead > 0.0)[particles.member]
+            if not channel and (isinstance(lead, Tensor) or lead):
                 velocity = with_channel_flux(particles, velocity, free, plane, speed, self._run_out)
         return particles.changed(velocity=velocity)
 
@@ -207,18 +243,21 @@ class Reservoirs(ValveModel):
         kind, gone = particles.kind, torch.zeros_like(particles.fluid)
         fresh: list[Particles] = []
         for number, plane in self.openings.active(clock):
-            height, lead = plane.height(particles.position), self._lead(number, clock)
+            height, lead = plane.height(particles.position), self._lead(number, clock, particles.members)
+            lead = lead[particles.member] if isinstance(lead, Tensor) else torch.full_like(height, lead)
             buffer, channel = RESERVOIR + number, CHANNEL - number
             entered = ((kind == buffer) | (kind == channel)) & (height < 0.0)
             fed = entered & (kind == buffer)
             if bool(fed.any()):
                 copy = particles.select(fed)
-                fresh.append(copy.changed(position=copy.position + (self._far - lead) * plane.normal))
+                fresh.append(copy.changed(position=copy.position + (self._far - lead[fed])[:, None] * plane.normal))
             out = self._left(kind, height, plane, particles)
             beyond = ((kind == buffer) | (kind == channel) | out) & ~entered
-            if not lead and bool((beyond & (kind == channel)).any()):
+            turned = lead == 0.0
+            if bool((beyond & turned & (kind == channel)).any()):
                 # what drifted freely behind an outlet is no profile for the inlet that it has turned into
-                velocity = torch.where(beyond[:, None], plane.velocity, particles.velocity)
+                inlet = beyond & turned & self._of_members_with(beyond & turned & (kind == channel), particles)
+                velocity = torch.where(inlet[:, None], plane.velocity, particles.velocity)
                 particles = particles.changed(velocity=velocity)
             kind = torch.where(beyond, torch.where(height < lead, channel, buffer), kind)
             kind = torch.where(entered, torch.full_like(kind, FLUID), kind)
@@ -231,6 +270,11 @@ class Reservoirs(ValveModel):
         for copy in fresh:
             particles = particles.joined(copy)
         return particles, True
+
+    @staticmethod
+    def _of_members_with(rows: Tensor, particles: Particles) -> Tensor:
+        """(N,) bool: particles of members that have any of the rows (N,) bool."""
+        return (particles.per_member(rows.to(torch.int64), "sum") > 0)[particles.member]
 
     def _account(
         self,

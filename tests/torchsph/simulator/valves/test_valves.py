@@ -149,13 +149,10 @@ def test_thesis_preset_loses_no_particle_without_saying(scene):
 
 
 @pytest.mark.slow
+@pytest.mark.phantom("lv_phantom_a.h5")
 def test_one_beat_of_the_phantom_in_the_thesis_preset_stays_finite():
-    """Issue 2: finite, every particle accounted for, density range reported (2.5 mm)."""
-
-    path = SHARED_DATA / "lv_phantom_a.h5"
-    if not path.exists():
-        pytest.skip(f"no phantom at {path}")
-    recording = geometry.read_recording(path)
+    """Finite, every particle accounted for, density range reported (2.5 mm)."""
+    recording = geometry.read_recording(SHARED_DATA / "lv_phantom_a.h5")
     run = Simulator(Scene.from_recording(recording, 2.5e-3), preset("thesis")).start(float(recording.time[0]))
     mask = torch.from_numpy(np.ascontiguousarray(recording.mask[0]))
     run.impose(recording.grid, torch.from_numpy(recording.velocity[0]), mask)
