@@ -87,7 +87,7 @@ class GridForecast:
         """
         self.run.advance(time)
         found = self.run.fetch(self.grid, mask)
-        if self._lost is None:
+        if self._lost is None or self.transfer.fade is None:
             return found.value, found.covered
         share = math.exp(-(time - self.start_time) / self.transfer.fade)
         return found.value + share * self._lost * found.covered[:, None], found.covered
@@ -220,8 +220,8 @@ def _from_one_start(
         sums[lead].add(field_, initial, later, mask[start] & mask[frame])
         if kept is not None:
             kept[lead].append((frame, field_.astype(np.float32), missing))
-    for name, value in going.run.record.totals().items():
-        totals[name] = totals.get(name, 0) + value
+    for name, count in going.run.record.totals().items():
+        totals[name] = totals.get(name, 0) + count
 
 
 def _as_recording(recording: geometry.Recording, frames: list, lead: float) -> geometry.Recording:

@@ -15,7 +15,6 @@ import torch
 from torch import Tensor
 
 from torchsph.pairs.interface import Backend
-from torchsph.pairs.vectors import per_particle
 
 from ..schemes.valve_models import Reservoir
 from ..state.clock import Clock
@@ -24,17 +23,16 @@ from ..state.record import Record
 from .accounts import note_passed
 from .buffer_flow import AREA_TRUST, mean_near, scaled_profile, volume_of_rows, with_channel_flux
 from .cavity_volume import CavityVolume
-from .flux_split import FluxSplit, fluxes, takers
+from .flux_split import FluxSplit, fluxes, fluxes_of_buffers, fluxes_of_field, takers
 from .model import Pressure, ValveModel, ValveSetting
 from .openings import OpeningPlane, Openings
 from .pressure_reservoirs import PressureReservoirs
+from .volume_match import levelled, volume_inside
 
 # how far beyond the plane (spacings) an outgoing particle changes to buffer, and an incoming one to fluid
 _HYSTERESIS = 0.25
 # depth inside the orifice (spacings) at which the profile of an imposed field is read
 _MOUTH = 0.5
-# what stands this far (spacings) on both sides of the plane counts in part as being inside: particles come in layers
-_BLEND = 1.5
 
 
 class Reservoirs(ValveModel):
@@ -71,45 +69,18 @@ class Reservoirs(ValveModel):
         s = self._setting
         return PressureReservoirs(self.openings, backend, s.support_radius, unit, s.period, s.device)
 
-    def _deficit(self, particles: Particles, times: Tensor, clock: Clock) -> Tensor:
-        """Volume that the particles inside fall short of the cavity's, (members,), internal.
-
-        A particle in an open orifice counts by the part that is inside, blended in over a spacing at the rim, so that
-        the sum does not jump as it crosses.
-        """
-        part = particles.inside.to(particles.mass.dtype)
-        for _, plane in self.openings.active(clock):
-            height = plane.height(particles.position)
-            row = torch.nonzero(height.abs() < _BLEND).squeeze(1)
-            over = plane.cover(particles.position[row])
-            inner = 0.5 - 0.5 / _BLEND * height[row]
-            part = part.index_put((row,), torch.lerp(part[row], inner * inner * (3.0 - 2.0 * inner), over))
-        # in double: thousands of equal masses added in single precision drift by more than the difference
-        filled = particles.per_member((part * particles.mass).double(), "sum")
-        return (self.volume.volume(times, torch.float64) - filled).to(self._setting.dtype)
-
-    def _levelled(self, particles: Particles, clock: Clock) -> Particles:
-        """Particles whose mean density deviation at the open valves is 0, in compressible schemes.
-
-        Where the speed of all that encloses a fluid is prescribed, the percents by which sums over neighbours miss the
-        volume that is swept add up, to a pressure that is the same everywhere and tells nothing but feeds disorder.
-        """
-        if not self._setting.compressible:
-            return particles
-        near = torch.zeros_like(particles.inside)
-        for _, plane in self.openings.active(clock):
-            near |= (particles.position - plane.centre).square().sum(1) < plane.radius**2
-        weight = torch.where(particles.inside & near, particles.mass, torch.zeros_like(particles.mass))
-        total = particles.per_member(weight, "sum").clamp_min(1.0)
-        mean = particles.per_member(weight * particles.deviation, "sum") / total
-        return particles.changed(deviation=particles.deviation - per_particle(mean, particles.member))
+    def _deficit(self, particles: Particles, clock: Clock) -> Tensor:
+        """Volume that the particles inside fall short of the cavity's, (members,), internal."""
+        filled = volume_inside(particles, [plane for _, plane in self.openings.active(clock)])
+        wanted = self.volume.volume(clock.of_members(particles.members), torch.float64)
+        return (wanted - filled).to(self._setting.dtype)
 
     def volume_deficit_rate(self, particles: Particles, clock: Clock) -> Tensor:
         """Part of the cavity's volume, per time, that should come in for what particles lack, (members,)."""
         times = clock.of_members(particles.members)
         if self.relaxation is None:
             return torch.zeros_like(times, dtype=self._setting.dtype)
-        return self._deficit(particles, times, clock) / (self.volume.volume(times) * self.relaxation)
+        return self._deficit(particles, clock) / (self.volume.volume(times) * self.relaxation)
 
     def _lead(self, number: int, clock: Clock, members: int) -> float | Tensor:
         """Length of the free channel before the buffer of an opening: 0 where fluid enters in the present interval.
@@ -137,12 +108,7 @@ class Reservoirs(ValveModel):
     def note_split(self, velocity: Tensor, clock: Clock) -> None:
         """Read how openings share what they pass off a field (members, n, D) at their ``split_points``."""
         free = takers(self.openings, self.openings.active(clock))
-        counts = [len(plane.quadrature()) for _, plane in free]
-        read = [
-            -plane.area * ((part - plane.velocity) @ plane.normal).mean(1)
-            for (_, plane), part in zip(free, velocity.split(counts, dim=1), strict=True)
-        ]
-        self._keep_split(torch.stack(read, 1), free, clock)
+        self._keep_split(fluxes_of_field(velocity, free), free, clock)
 
     def _keep_split(self, read: Tensor, free: list[tuple[int, OpeningPlane]], clock: Clock) -> None:
         """Keep fluxes (members, n) that were read of some openings, brought to sum to what they pass together."""
@@ -155,15 +121,9 @@ class Reservoirs(ValveModel):
     def _read_buffers(self, particles: Particles, clock: Clock) -> None:
         """Read how openings share what they pass off the velocities of their buffers, where a run goes on."""
         free = takers(self.openings, self.openings.active(clock))
-        behind = [(particles.kind == RESERVOIR + n) | (particles.kind == CHANNEL - n) for n, _ in free]
-        if len(free) < 2 or not all(bool(one.any()) for one in behind):
-            return
-        read = []
-        for (_, plane), one in zip(free, behind, strict=True):
-            along = torch.where(one, ((particles.velocity - plane.velocity) * plane.normal).sum(1), 0.0)
-            count = particles.per_member(one.to(along.dtype), "sum").clamp_min(1.0)
-            read.append(-plane.area * particles.per_member(along, "sum") / count)
-        self._keep_split(torch.stack(read, 1), free, clock)
+        read = fluxes_of_buffers(particles, free)
+        if read is not None:
+            self._keep_split(read, free, clock)
 
     def opened(self, particles: Particles, clock: Clock) -> Particles:
         """Make the buffers of valves that are open and have none, drop those of valves that have shut."""
@@ -210,8 +170,9 @@ class Reservoirs(ValveModel):
         times = clock.of_members(particles.members)
         inflow, active, given = self.volume.rate(times), self.openings.active(clock), self.openings.given
         if self.relaxation is not None and not channel and not any(number in given for number, _ in active):
-            inflow = inflow + self._deficit(particles, times, clock) / self.relaxation
-            particles = self._levelled(particles, clock)
+            inflow = inflow + self._deficit(particles, clock) / self.relaxation
+            if self._setting.compressible:
+                particles = levelled(particles, [plane for _, plane in active])
         velocity, through = particles.velocity, fluxes(self.openings, clock, inflow)
         for number, plane in active:
             if number in given:
