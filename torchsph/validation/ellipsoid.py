@@ -11,7 +11,7 @@ from scipy.special import eval_legendre
 import geometry
 from torchsph.simulator.scene import Fluid, Scene, Valve
 from torchsph.simulator.schemes.presets import Scheme, preset
-from torchsph.simulator.schemes.weakly_compressible import CompleteKernelWall
+from torchsph.simulator.schemes.wall_models import CompleteKernelWall
 from torchsph.simulator.simulation import Simulation
 from torchsph.simulator.simulator import Simulator
 
@@ -109,9 +109,9 @@ class PulsatingEllipsoid:
 
     def missing(self, run: Simulation) -> float:
         """Part of the cavity's volume that the particles fall short of; what stands in the opening counts in part."""
-        run.domain.at(run.time)
-        valves = run.domain.reservoirs
-        return float(valves.shortfall(run.particles)) * valves.relaxation
+        run.surroundings.at(run.time)
+        rate = run.domain.valves.volume_deficit_rate(run.particles, run.surroundings.clock)
+        return float(rate) * run.domain.scheme.valve.relaxation
 
     def flow(self, time: float, order: int = 40) -> PotentialFlow:
         """The potential flow at ``time`` (s): the wall's normal velocity, a plug through the opening."""

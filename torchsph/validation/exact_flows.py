@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from torchsph.simulator.schemes.weakly_compressible import CompleteKernelWall
+from torchsph.simulator.schemes.wall_models import CompleteKernelWall
 
 _SERIES_TERMS = 200
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 import geometry
 from torchsph.pairs import backend as choose_backend
-from torchsph.simulator.imposing import fetch_at
+from torchsph.pairs.moving_least_squares import fetch_at
 from torchsph.simulator.scene import Fluid, Scene
 from torchsph.simulator.schemes.presets import Scheme
 from torchsph.simulator.schemes.weakly_compressible import WeaklyCompressible

@@ -8,7 +8,9 @@ import torch
 
 from torchsph import XSPH, Scene, Simulator, WeaklyCompressible
 from torchsph.simulator.scene import Fluid
+from torchsph.simulator.schemes.weakly_compressible import ORDERS
 from torchsph.simulator.state.particles import Particles
+from torchsph.simulator.stepping.time_schemes import TIME_SCHEMES
 
 STEPS = (32, 64, 128)
 
@@ -61,6 +63,10 @@ def observed(order, viscosity):
 def test_order_of_the_steps(order, viscosity, expected):
     """Verlet loses an order to viscous forces, as its documentation says; the predictor-corrector keeps it."""
     assert observed(order, viscosity) == pytest.approx(expected, abs=0.25)
+
+
+def test_every_order_that_a_scheme_can_name_is_stepped():
+    assert set(TIME_SCHEMES) == set(ORDERS)
 
 
 def test_options_that_would_be_ignored_are_refused():

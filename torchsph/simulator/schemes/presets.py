@@ -5,7 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 from .projection import Projection
-from .weakly_compressible import XSPH, PotentialWall, PressureSource, WeaklyCompressible
+from .valve_models import PressureSource
+from .wall_models import PotentialWall
+from .weakly_compressible import XSPH, WeaklyCompressible
 
 Scheme = WeaklyCompressible | Projection
 

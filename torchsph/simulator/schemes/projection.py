@@ -6,8 +6,9 @@ from dataclasses import dataclass, field
 
 from torchsph.pairs.smoothing_kernels import kernel
 
-from ..population import PopulationControl
-from .weakly_compressible import CompleteKernelWall, Reservoir
+from .population_control import PopulationControl
+from .valve_models import Reservoir
+from .wall_models import CompleteKernelWall
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,9 @@ from dataclasses import dataclass, field
 from torchsph.pairs.interface import CONTINUITY_FORMS, PRESSURE_FORMS
 from torchsph.pairs.smoothing_kernels import kernel
 
-from ..population import PopulationControl
+from .population_control import PopulationControl
+from .valve_models import PressureSource, Reservoir
+from .wall_models import CompleteKernelWall, PotentialWall
 
 ORDERS = ("thesis", "symplectic", "verlet", "predictor_corrector")
 
@@ -79,90 +81,6 @@ class Rollback:
             raise ValueError(f"Rollback needs at least one try and one step, got {self.tries}, {self.every}")
         if not 0 <= self.density[0] < 1 < self.density[1]:
             raise ValueError(f"Rollback.density must be a range around 1, got {self.density}")
-
-
-@dataclass(frozen=True)
-class PotentialWall:
-    """The thesis's wall (3.1, 3.2): potential U(s) = stiffness c^2 s^2 / 2 with s = 1 - d / reach for d < reach.
-
-    Attributes:
-        stiffness: wall potential at d = 0 in units of c^2 / 2.
-        reach: distance at which the potential starts, in particle spacings.
-        relaxation: time constant tau of the no-slip retardation at the wall, in reach / c; None: free slip. The factor
-            per step is xi = 1 - exp(-dt / tau * s), applied to the tangential velocity relative to the wall.
-    """
-
-    stiffness: float = 0.2
-    reach: float = 1.0
-    relaxation: float | None = 1.0
-
-    def __post_init__(self) -> None:
-        if not self.stiffness > 0 or not self.reach > 0:
-            raise ValueError(f"PotentialWall needs positive stiffness and reach, got {self.stiffness}, {self.reach}")
-        if self.relaxation is not None and not self.relaxation > 0:
-            raise ValueError(f"PotentialWall.relaxation must be positive or None, got {self.relaxation}")
-
-
-@dataclass(frozen=True)
-class CompleteKernelWall:
-    """Wall by the analytic kernel integrals behind it (Ferrand et al. 2013): no wall particles, one look-up each.
-
-    Attributes:
-        no_slip: laminar friction with the wall (True) or free slip.
-        gap: particles are kept this far inside the wall, in particle spacings.
-        sliding: for walls that slide past others at an edge, as the lid of a cavity does. What they sweep is then
-            integrated over the surface; otherwise the nearest wall's velocity stands for all that a kernel sees, and
-            a lid would seem to push the side walls (3 % of density in the corners, and noise from there).
-    """
-
-    no_slip: bool = True
-    gap: float = 0.05
-    sliding: bool = False
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.gap < 0.5:
-            raise ValueError(f"CompleteKernelWall.gap must lie in [0, 0.5), got {self.gap}")
-
-
-@dataclass(frozen=True)
-class PressureSource:
-    """A timed pressure source at an open valve (3.3, 3.4), softened inside ``core``.
-
-    The strength Q follows from continuity: the acceleration that changes the flux through the orifice as the volume of
-    the cavity demands, spread over a half-sphere around the orifice. ``core`` is in orifice radii.
-    """
-
-    core: float = 0.5
-
-    def __post_init__(self) -> None:
-        if not self.core > 0:
-            raise ValueError(f"PressureSource.core must be positive, got {self.core}")
-
-
-@dataclass(frozen=True)
-class Reservoir:
-    """An open valve as an opening with a buffer of particles behind it whose flux follows from dV/dt.
-
-    Attributes:
-        profile: "field" (the velocity profile of the imposed field, flat where it has none) or "flat".
-        relaxation: time (spacings per reference speed) in which a difference between the particles' volume and the
-            cavity's is let through the open valve on top of dV/dt, or None.
-        run_out: length (spacings) of free channel between an outlet and its buffer, 0 or more than 1. A scheme that
-            projects needs as much as its kernel reaches: no pressure can bring a particle to the speed of a prescribed
-            one beside it.
-    """
-
-    profile: str = "field"
-    run_out: float = 0.0
-    relaxation: float | None = 5.0
-
-    def __post_init__(self) -> None:
-        if self.profile not in ("field", "flat"):
-            raise ValueError(f"Reservoir.profile must be 'field' or 'flat', got '{self.profile}'")
-        if self.run_out != 0 and not self.run_out > 1:
-            raise ValueError(f"Reservoir.run_out must be 0 or more than 1 spacing, got {self.run_out}")
-        if self.relaxation is not None and not self.relaxation > 0:
-            raise ValueError(f"Reservoir.relaxation must be positive or None, got {self.relaxation}")
 
 
 @dataclass(frozen=True)
