@@ -14,12 +14,13 @@ from .pairs.smoothing_kernels import KERNELS, SmoothingKernel, kernel
 from .simulator.grid_forecast import ForecastSkill, GridForecast, Transfer, skill
 from .simulator.residual_motion import ResidualMotion, residual_motion
 from .simulator.scene import Fluid, Scene, Valve
+from .simulator.schemes.parts import XSPH, GammaRamp, Rollback
 from .simulator.schemes.population_control import PopulationControl
 from .simulator.schemes.presets import PRESETS, preset
 from .simulator.schemes.projection import Projection
 from .simulator.schemes.valve_models import PressureSource, Reservoir
 from .simulator.schemes.wall_models import CompleteKernelWall, PotentialWall
-from .simulator.schemes.weakly_compressible import XSPH, GammaRamp, Rollback, WeaklyCompressible
+from .simulator.schemes.weakly_compressible import WeaklyCompressible
 from .simulator.seeding import Seeding
 from .simulator.simulation import NumericalFailure, Simulation
 from .simulator.simulator import Simulator

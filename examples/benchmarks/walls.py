@@ -49,7 +49,7 @@ import geometry
 from torchsph import CompleteKernelWall, PotentialWall, Scene, Simulator, WeaklyCompressible
 from torchsph.pairs.smoothing_kernels import kernel
 from torchsph.simulator.scene import Fluid
-from torchsph.simulator.schemes.presets import Scheme
+from torchsph.simulator.schemes.scheme import Scheme
 from torchsph.simulator.simulation import Simulation
 from torchsph.simulator.surroundings import PresentSurroundings
 from torchsph.simulator.walls import closest as wall_closest

@@ -9,12 +9,12 @@ from geometry import WallMotion
 from torchsph.pairs.smoothing_kernels import kernel
 
 from .scene import Scene
-from .schemes.presets import Scheme
+from .schemes.scheme import Scheme
 from .state.energy import energy_unit
 from .state.particles import Particles
 from .state.units import Units
 from .valves.model import ValveModel, ValveSetting
-from .valves.registry import make_valves
+from .valves.registry import valve_model
 from .walls.fields import WallFields
 
 
@@ -54,14 +54,15 @@ class Domain:
                 dtype,
                 sliding=scheme.wall.sliding,
             )
-            self.valves = make_valves(scheme.valve, self._valve_setting(self.walls))
+            if scheme.valve is not None and scene.valves:
+                self.valves = valve_model(scheme.valve, self._valve_setting(self.walls))
 
     def _valve_setting(self, walls: WallFields) -> ValveSetting:
         return ValveSetting(
             self.scene,
             self.units,
             self.support_radius,
-            self.scheme.sound_speed is not None,
+            self.scheme.compressible,
             walls.key_times.wrapped,
             self.period,
             self.device,

@@ -13,6 +13,7 @@ from torchsph.pairs.smoothing_kernels import kernel
 
 from .domain import Domain
 from .schemes.wall_models import PotentialWall
+from .schemes.weakly_compressible import WeaklyCompressible
 from .state.neighbour_list import PairSearch
 from .state.particles import FLUID, Particles
 from .stepping.pressure import Neighbourhood, packing
@@ -166,10 +167,10 @@ def _boltzmann(surroundings: PresentSurroundings, seeding: Seeding, generator: t
     U0 is the potential of the free interior, 0. Points beyond the wall are refused whatever their potential.
     """
     domain = surroundings.domain
-    model = domain.scheme.wall
-    if not isinstance(model, PotentialWall):
+    scheme, model = domain.scheme, domain.scheme.wall
+    if not isinstance(scheme, WeaklyCompressible) or not isinstance(model, PotentialWall):
         raise ValueError("Boltzmann seeding needs a potential wall; use Seeding(kind='quiet')")
-    sound = domain.scheme.sound_speed / domain.units.speed
+    sound = scheme.sound_speed / domain.units.speed
     scale = seeding.temperature * 0.5 * model.stiffness * sound**2
     lower, upper = _wall_box(surroundings)
     origin = torch.floor(lower)

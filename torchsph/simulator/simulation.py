@@ -19,8 +19,7 @@ from .imposing import pulled
 from .population import Population
 from .rollback import Checkpoints
 from .scene import Scene
-from .schemes.presets import Scheme
-from .schemes.projection import Projection
+from .schemes.scheme import Scheme
 from .state.neighbour_list import PairSearch
 from .state.particles import Particles, held, held_rows
 from .state.record import Record
@@ -45,9 +44,9 @@ FETCH_RADIUS = 2.0
 _LEAST_FILLING = 0.9
 
 
-def check_filled(scheme: Projection, domain: Domain, particles: Particles, time: float) -> None:
+def check_filled(domain: Domain, particles: Particles, time: float) -> None:
     """ValueError where fluid does not fill its walls, or its box, though the scheme knows of no free surface."""
-    if scheme.surface is not None or particles.count == 0:
+    if not domain.scheme.must_fill or particles.count == 0:
         return
     filling = float(domain.filling(particles, time).min())
     if filling < _LEAST_FILLING:
@@ -105,13 +104,12 @@ class Simulation:
         self.surroundings, self._backend = PresentSurroundings(domain), backend
         scene, scheme = domain.scene, domain.scheme
         self.record = Record(particles.members, len(scene.valves), particles.position.device)
-        self.parameters = Parameters.of(scheme, scene.fluid)
+        self.parameters = Parameters.of(scheme, scene.fluid.viscosity)
         self._coefficients = Coefficients.of(self.parameters, self.units, scene.fluid.density)
         # incompressible steps see their neighbours once; lists of that moment also make them independent of a batch
-        margin = 0.0 if isinstance(scheme, Projection) else _SEARCH_MARGIN
+        margin = _SEARCH_MARGIN if scheme.compressible else 0.0
         search = PairSearch(self._backend, self.domain.support_radius, margin, self.domain.period)
-        if isinstance(scheme, Projection):
-            check_filled(scheme, domain, particles, self.time)
+        check_filled(domain, particles, self.time)
         buffered = domain.valves.has_buffers
         self._stepper = make_stepper(
             scheme, self._coefficients, search, scene.dimension, self.record, buffered=buffered
@@ -163,7 +161,7 @@ class Simulation:
         """Limit of the steps to time ``until`` (s) that the scheme names outright, internal."""
         scheme = self.domain.scheme
         longest = (until - self.time) / (scheme.steps_per_frame or 1)
-        if isinstance(scheme, Projection) and scheme.max_step is not None:
+        if scheme.max_step is not None:
             longest = min(longest, scheme.max_step)
         return longest / self.units.time
 
@@ -174,9 +172,8 @@ class Simulation:
         where the scheme has no place for it.
         """
         scheme = self.domain.scheme
-        changeable = ("shifting", "courant", "viscosity", "valve_strength")
-        if isinstance(scheme, Projection) and not set(values) <= set(changeable):
-            known = ", ".join(changeable)
+        if scheme.changeable is not None and not set(values) <= set(scheme.changeable):
+            known = ", ".join(scheme.changeable)
             raise ValueError(f"of the incompressible scheme only {known} can change, got {list(values)}")
         if values.get("xsph") is not None and scheme.xsph is None:
             raise ValueError("parameter 'xsph' needs a scheme with XSPH, which says of what level and form it is")
@@ -308,7 +305,7 @@ class Simulation:
         if not math.isfinite(float(p.position.sum() + p.velocity.sum() + p.deviation.sum())):
             finite = torch.isfinite(p.position).all(1) & torch.isfinite(p.velocity).all(1) & torch.isfinite(p.deviation)
             broken = p.per_member((~finite).to(torch.int64), "sum") > 0
-        if scheme.sound_speed is not None:
+        if scheme.compressible:
             lowest, highest = (p.per_member(p.deviation, way) for way in ("amin", "amax"))
             self.record.note_density(lowest, highest)
             if scheme.rollback is not None:

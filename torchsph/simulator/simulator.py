@@ -10,7 +10,8 @@ from torchsph.pairs import backend as choose_backend
 
 from .domain import Domain
 from .scene import Scene
-from .schemes.presets import Scheme, preset
+from .schemes.presets import preset
+from .schemes.scheme import Scheme
 from .seeding import Seeding, seed_particles
 from .simulation import Simulation
 from .state.particles import Particles

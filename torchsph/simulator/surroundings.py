@@ -137,7 +137,7 @@ class PresentSurroundings:
         which is far below a spacing, so that one look-up per step does.
         """
         scheme = self.domain.scheme
-        if scheme.sound_speed is not None:
+        if scheme.compressible:
             after = self.domain.valves.driven(after, self.clock)  # incompressible steps drive them half-way
         if wall is None or not scheme.wall.hard:
             return after

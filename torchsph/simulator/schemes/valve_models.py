@@ -3,6 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar, Protocol
+
+
+class ValveOptions(Protocol):
+    """What the engine asks of the options of any valve model; ``valves.registry`` knows which model is theirs."""
+
+    @property
+    def needs_compressible(self) -> bool:
+        """Whether the model needs a fluid with an equation of state."""
 
 
 @dataclass(frozen=True)
@@ -14,6 +23,7 @@ class PressureSource:
     """
 
     core: float = 0.5
+    needs_compressible: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         if not self.core > 0:
@@ -36,6 +46,7 @@ class Reservoir:
     profile: str = "field"
     run_out: float = 0.0
     relaxation: float | None = 5.0
+    needs_compressible: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         if self.profile not in ("field", "flat"):

@@ -29,6 +29,10 @@ class WallModel(Protocol):
     def no_slip(self) -> bool:
         """Whether the wall brakes the fluid that slides along it."""
 
+    @property
+    def needs_compressible(self) -> bool:
+        """Whether the wall acts through the speed of sound, which an incompressible scheme does not have."""
+
 
 @dataclass(frozen=True)
 class PotentialWall:
@@ -48,6 +52,7 @@ class PotentialWall:
     hard: ClassVar[bool] = False
     gap: ClassVar[float] = 0.0
     sliding: ClassVar[bool] = False
+    needs_compressible: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         if not self.stiffness > 0 or not self.reach > 0:
@@ -78,6 +83,7 @@ class CompleteKernelWall:
     sliding: bool = False
     complete: ClassVar[bool] = True
     hard: ClassVar[bool] = True
+    needs_compressible: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         if not 0 <= self.gap < 0.5:

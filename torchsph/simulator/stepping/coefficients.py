@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from ..scene import Fluid
-from ..schemes.projection import Projection
-from ..schemes.weakly_compressible import GammaRamp, WeaklyCompressible
+from ..schemes.parts import GammaRamp
+from ..schemes.scheme import Scheme
 from ..state.units import Units
 
 # parameters that a scheme cannot do without; the others are switched off by None
@@ -52,14 +52,14 @@ class Parameters:
     valve_strength: float | Tensor = 1.0
 
     @classmethod
-    def of(cls, scheme: WeaklyCompressible | Projection, fluid: Fluid) -> Parameters:
-        """What a scheme and a fluid say."""
+    def of(cls, scheme: Scheme, viscosity: float) -> Parameters:
+        """What a scheme says, for a fluid of dynamic ``viscosity`` (Pa s)."""
         others = ("xsph", "viscosity", "valve_strength")
-        given = {f.name: getattr(scheme, f.name) for f in fields(cls) if f.name not in others}
+        given: dict[str, Any] = {f.name: getattr(scheme, f.name, None) for f in fields(cls) if f.name not in others}
         return cls(
             **given,
             xsph=None if scheme.xsph is None else scheme.xsph.epsilon,
-            viscosity=fluid.viscosity if scheme.laminar_viscosity else None,
+            viscosity=viscosity if scheme.laminar_viscosity else None,
         )
 
     def changed(self, like: Tensor, members: int, **values: float | Sequence[float] | Tensor | None) -> Parameters:

@@ -23,11 +23,12 @@ from .connected_parts import components
 
 # densities that a source can react to: what is denser or thinner by more is a fault of another kind
 _LARGEST_EXCESS = 0.3
-_TINY = 1e-6
+# volumes and lengths are divided by nothing smaller
+_SMALLEST = 1e-6
 # classes of the kernel's completeness, in which particles are compared
 _CLASSES = 16
 # a displacement of more than this (spacings) would outrun the linearisation
-_LARGEST_MOVE = 0.2
+_LONGEST_MOVE = 0.2
 # part of a full kernel's moment below which no slope is drawn from what is left of it
 _SMALLEST_MOMENT = 0.3
 # cosine between the completeness's gradient and the wall's normal below which a wall is not plain
@@ -111,7 +112,7 @@ class Neighbourhood:
         size = p.members * (_CLASSES + 1)
         count = filling.new_zeros(size).index_add(0, group, weight)
         mean = filling.new_zeros(size).index_add(0, group, weight * filling) / count.clamp_min(1.0)
-        excess = (filling / mean[group].clamp_min(_TINY) - 1.0).clamp(-_LARGEST_EXCESS, _LARGEST_EXCESS)
+        excess = (filling / mean[group].clamp_min(_SMALLEST) - 1.0).clamp(-_LARGEST_EXCESS, _LARGEST_EXCESS)
         return torch.where(counted, excess, torch.zeros_like(excess))
 
     def _wall_jump(self, wall: CompleteWallSample) -> Tensor:
@@ -132,7 +133,7 @@ class Neighbourhood:
         rise = -inner(fall, wall.normal) / moment
         jump = inner(wall.velocity, wall.normal) - along + wall.distance.clamp_min(0.0) * rise
         # where walls meet at an edge there is no such line to continue on
-        cosine = inner(wall.completeness_gradient, wall.normal) / steep.clamp_min(_TINY)
+        cosine = inner(wall.completeness_gradient, wall.normal) / steep.clamp_min(_SMALLEST)
         plain = (cosine - _EDGE).clamp_min(0.0) / (1.0 - _EDGE)
         source = plain * jump * steep / wall.completeness.clamp_min(SMALLEST_COMPLETENESS)
         return torch.where(p.fluid, source, torch.zeros_like(jump))
@@ -187,7 +188,7 @@ class Neighbourhood:
             found = replace(found, values=found.values + fixed)
         if self.completeness is not None:
             volume = torch.where(fluid, p.mass, torch.zeros_like(p.mass)).double()
-            part = p.per_member(volume * self.completeness, "sum").clamp_min(_TINY)
+            part = p.per_member(volume * self.completeness, "sum").clamp_min(_SMALLEST)
             found = replace(found, mismatch=found.mismatch * p.per_member(volume, "sum") / part)
         return self._descent(found.values, coupled), found
 
@@ -251,7 +252,7 @@ class Neighbourhood:
         The gradient by differences is exact for a constant pressure but, unlike the symmetric one, not antisymmetric.
         """
         p = self.particles
-        mass = p.per_member(p.mass, "sum").clamp_min(_TINY)
+        mass = p.per_member(p.mass, "sum").clamp_min(_SMALLEST)
         total = acceleration.new_zeros((p.members, acceleration.shape[1]))
         thrust = total.index_add(0, p.member, p.mass[:, None] * acceleration)
         return acceleration - (thrust / mass[:, None]).index_select(0, p.member)
@@ -296,4 +297,4 @@ def packing(around: Neighbourhood, *, tolerance: float = 3e-2, iterations: int =
     source = excess.clamp(-_LARGEST_EXCESS, _LARGEST_EXCESS)
     move, _ = around.project(source, None, None, tolerance, iterations)
     length = move.norm(dim=1, keepdim=True)
-    return move * (_LARGEST_MOVE / length.clamp_min(_LARGEST_MOVE)), excess
+    return move * (_LONGEST_MOVE / length.clamp_min(_LONGEST_MOVE)), excess

@@ -5,6 +5,7 @@ from __future__ import annotations
 from torch import Tensor
 
 from ..schemes.projection import Projection
+from ..schemes.scheme import Scheme
 from ..schemes.weakly_compressible import WeaklyCompressible
 from ..state.neighbour_list import PairSearch
 from ..state.particles import Particles
@@ -25,7 +26,7 @@ class WeaklyCompressibleStepper(WeaklyCompressibleSums):
 
 
 def make_stepper(
-    scheme: WeaklyCompressible | Projection,
+    scheme: Scheme,
     coefficients: Coefficients,
     search: PairSearch,
     dimension: int,
@@ -42,7 +43,12 @@ def make_stepper(
         dimension: 2 or 3.
         record: account of the run, which projections write to.
         buffered: whether there can be particles of reservoirs.
+
+    Raises:
+        TypeError: the scheme is of no known type.
     """
     if isinstance(scheme, Projection):
         return ProjectionStepper(scheme, coefficients, search, dimension, record)
+    if not isinstance(scheme, WeaklyCompressible):
+        raise TypeError(f"no stepper is known for a scheme of type {type(scheme).__name__}")
     return WeaklyCompressibleStepper(scheme, coefficients, search, dimension, buffered=buffered)

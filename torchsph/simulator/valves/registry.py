@@ -1,31 +1,31 @@
-"""Which valve model belongs to which options: a new one is a row here."""
+"""Which valve model belongs to which options: a new model is registered here, and nowhere else."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
+from functools import singledispatch
 
 from ..schemes.valve_models import PressureSource, Reservoir
 from .model import ValveModel, ValveSetting
 from .pressure_sources import PressureSources
 from .reservoirs import Reservoirs
 
-# options -> model; called with the options and the setting
-_MODELS: dict[type, Callable[[Any, ValveSetting], ValveModel]] = {
-    PressureSource: PressureSources,
-    Reservoir: Reservoirs,
-}
 
-
-def make_valves(options: object | None, setting: ValveSetting) -> ValveModel:
-    """The valve model of some options; valves that stay shut where there are none, or no valves.
+@singledispatch
+def valve_model(options: object, setting: ValveSetting) -> ValveModel:
+    """What valves do to particles, by the options of their model.
 
     Raises:
-        ValueError: no model is known for the options.
+        TypeError: ``options`` are of no type that is registered.
     """
-    if options is None or not setting.scene.valves:
-        return ValveModel()
-    if type(options) not in _MODELS:
-        known = ", ".join(sorted(kind.__name__ for kind in _MODELS))
-        raise ValueError(f"no valve model is known for {options!r}; known options: {known}")
-    return _MODELS[type(options)](options, setting)
+    known = ", ".join(sorted(kind.__name__ for kind in valve_model.registry if kind is not object))
+    raise TypeError(f"no model is registered for valves of type {type(options).__name__}; known: {known}")
+
+
+@valve_model.register
+def _(options: PressureSource, setting: ValveSetting) -> ValveModel:
+    return PressureSources(options, setting)
+
+
+@valve_model.register
+def _(options: Reservoir, setting: ValveSetting) -> ValveModel:
+    return Reservoirs(options, setting)

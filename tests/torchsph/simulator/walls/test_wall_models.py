@@ -45,9 +45,9 @@ def column(members=1):
     """A square of fluid at rest on the tank's floor, its density in balance with gravity."""
     axis = torch.arange(ACROSS, dtype=torch.float64) + 0.5
     place = torch.cartesian_prod(axis, axis)
-    label, one = torch.zeros(len(place), dtype=torch.int64), torch.ones(len(place), dtype=torch.float64)
+    label, ones = torch.zeros(len(place), dtype=torch.int64), torch.ones(len(place), dtype=torch.float64)
     weight = GRAVITY * (1 - place[:, 1] / ACROSS) / FREE_SURFACE_OPTIONS["sound_speed"] ** 2
-    return Particles(place, 0 * place, weight, one, label, label + FLUID, 1).repeated(members)
+    return Particles(place, 0 * place, weight, ones, label, label + FLUID, 1).repeated(members)
 
 
 def energy(run):

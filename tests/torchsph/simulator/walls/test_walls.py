@@ -202,9 +202,9 @@ def test_walls_that_bound_no_fluid_are_refused(fault):
 
 def test_walls_that_touch_themselves_bound_both_their_rooms():
     """Two boxes with a side in common: it is wall for both, and the distance is right on either side of it."""
-    one, other = (geometry.box((x, 0, 0), (x + 0.012, 0.012, 0.012), 2e-3) for x in (0.0, 0.012))
+    left, right = (geometry.box((x, 0, 0), (x + 0.012, 0.012, 0.012), 2e-3) for x in (0.0, 0.012))
     both = geometry.Surface(
-        np.concatenate([one.vertices, other.vertices]), np.concatenate([one.faces, other.faces + len(one.vertices)])
+        np.concatenate([left.vertices, right.vertices]), np.concatenate([left.faces, right.faces + len(left.vertices)])
     )
     made = fields(both)
     key = made.key(0, ())
