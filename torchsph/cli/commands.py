@@ -26,6 +26,7 @@ from torchsph.methods.runtime import parallel
 
 from .arguments import LEADS
 from .convert import convert
+from .export import export
 from .findings import tell_findings
 from .outputs import output_folder, staged, write_json
 
@@ -333,4 +334,5 @@ COMMANDS = {
     "smooth": smooth,
     "info": info,
     "convert": convert,
+    "export": export,
 }
