@@ -11,10 +11,11 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
+from .errors import RecordingError
 from .field_checks import axis_order, wrapped_speeds
 from .finding import Finding
 from .recording import Recording
-from .rules import RecordingError, measured_nodes
+from .rules import measured_nodes
 from .wall_checks import bodies, fluxes, mask_and_wall, volumes, wall_motion
 
 LARGEST = 1.0  # m; hearts and vessels are smaller

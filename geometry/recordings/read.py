@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -10,8 +11,9 @@ import numpy as np
 from geometry.grids.grid import Grid
 
 from .checks import refuse_implausible
+from .errors import RecordingError
 from .recording import LAYOUT, REQUIRED, Recording, Wall
-from .rules import RecordingError
+from .rules import check_recording
 from .units import factor
 
 ELSEWHERE = "in another file, which is never followed; copy the data into this file"
@@ -50,7 +52,7 @@ def read_recording(path: str | Path) -> Recording:
             recording = _read(file, source)
         except OSError as fault:
             raise RecordingError(source, "file", f"is damaged: {fault}") from fault
-    recording.check(source)
+    check_recording(recording, source)
     refuse_implausible(recording, source)
     recording.velocity[~np.broadcast_to(recording.mask[:, None], recording.velocity.shape)] = 0
     return recording
@@ -71,9 +73,9 @@ def _read(file: h5py.File, source: str) -> Recording:
         raise RecordingError(source, "/velocity", rule)
     grid = _grid(file, dimension, velocity.shape[2:], source)
     names = {dataset: name for name, dataset, _ in LAYOUT}
-    wall = {names[d].removeprefix("wall."): a for d, a in arrays.items() if d.startswith("/wall/")}
-    rest = {names[d]: a for d, a in arrays.items() if not d.startswith("/wall/")}
-    numbers = {name: _number(file, name, source) for name in ("rho", "mu")}
+    wall: dict[str, Any] = {names[d].removeprefix("wall."): a for d, a in arrays.items() if d.startswith("/wall/")}
+    rest: dict[str, Any] = {names[d]: a for d, a in arrays.items() if not d.startswith("/wall/")}
+    numbers: dict[str, Any] = {name: _number(file, name, source) for name in ("rho", "mu")}
     period = _number(file, "period", source) if "period" in file.attrs else 0.0
     try:
         return Recording(

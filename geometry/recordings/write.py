@@ -11,6 +11,7 @@ import numpy as np
 
 from .checks import refuse_implausible
 from .recording import Recording
+from .rules import check_recording
 
 
 def write_recording(path: str | Path, recording: Recording, *, strict: bool = False) -> None:
@@ -23,7 +24,7 @@ def write_recording(path: str | Path, recording: Recording, *, strict: bool = Fa
     OSError where the disk is full. The velocity is stored as 0 outside the mask.
     """
     path = Path(path)
-    recording.check(str(path))
+    check_recording(recording, str(path))
     refuse_implausible(recording, str(path), strict=strict)
     if not path.parent.is_dir():
         raise FileNotFoundError(f"{path}: there is no directory {path.parent}; make it first")

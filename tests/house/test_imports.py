@@ -98,6 +98,8 @@ def test_the_top_level_holds_only_what_the_design_names():
         "examples",
         "pyproject.toml",
         "README.md",
+        "CONTRIBUTING.md",
+        "CHANGELOG.md",
         "LICENSE",
     }
     made_by_tools = {"build", "dist", "torchsph.egg-info", "torchsph-out", "venv", "shared"}

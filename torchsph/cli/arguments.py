@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable
 from typing import NoReturn
 
-from torchsph._version import __version__
+from torchsph import __version__
 
 from . import convert, export
 
@@ -37,6 +37,7 @@ def build_parser(commands: dict[str, Callable[[argparse.Namespace], None]], pres
         ("forecast", _forecast),
         ("measure", _measure),
         ("smooth", _smooth),
+        ("quantify", _quantify),
         ("info", _info),
         ("convert", convert.describe),
         ("export", export.describe),
@@ -122,6 +123,13 @@ def _smooth(parser: Parser, _: tuple[str, ...]) -> None:
     """Fit a B-spline field to each frame of a measurement."""
     parser.add_argument("measurement", metavar="MEASUREMENT.h5")
     parser.add_argument("--out", required=True, metavar="SMOOTH.h5", help="the smoothed recording")
+
+
+def _quantify(parser: Parser, _: tuple[str, ...]) -> None:
+    """Pressure, energy, forces and flow rates of a recording, over time and over the beat."""
+    parser.add_argument("analysis", metavar="ANALYSIS.h5", help="velocities: an analysis, a measurement, a truth")
+    parser.add_argument("--truth", metavar="TRUTH.h5", help="the true flow, to compare with")
+    _out(parser)
 
 
 def _info(parser: Parser, _: tuple[str, ...]) -> None:

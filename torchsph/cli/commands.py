@@ -15,8 +15,7 @@ import numpy as np
 import torch
 
 import geometry
-from torchsph import data
-from torchsph._version import __version__
+from torchsph import __version__, data
 from torchsph.assimilation import filter_figure
 from torchsph.evaluation import figures as report
 from torchsph.evaluation import metrics
@@ -29,6 +28,7 @@ from .convert import convert
 from .export import export
 from .findings import tell_findings
 from .outputs import output_folder, staged, write_json
+from .quantify import quantify
 
 __all__ = ["COMMANDS"]
 
@@ -332,6 +332,7 @@ COMMANDS = {
     "forecast": forecast,
     "measure": measure,
     "smooth": smooth,
+    "quantify": quantify,
     "info": info,
     "convert": convert,
     "export": export,
