@@ -141,7 +141,7 @@ def _check_components(source: Source, names: Sequence[str], sizes: list[dict[str
         if {letter: count for letter, count in size.items() if letter != "c"} != first:
             raise FormatError(f"{source.path}: {name} has the shape {size}, but {names[0]} has {sizes[0]}")
     count = sizes[0].get("c", 1) * len(names)
-    if count != dimension:
+    if count != dimension and (dimension, count, len(names)) != (2, 3, 1):  # a plane of vectors in space: its z is left
         raise FormatError(
             f"{source.path}: {dimension} components of velocity are needed, not {count} ({', '.join(names)})"
         )
@@ -151,6 +151,8 @@ def _affine(source: Source, said: FieldMap, counts: tuple[int, ...]) -> np.ndarr
     """From node numbers to places in metres, in LPS where the file is of a patient."""
     dimension = len(counts)
     affine = None if source.affine is None else np.array(source.affine, np.float64)
+    if affine is not None and len(affine) == 4 and dimension == 2:
+        affine = affine[np.ix_([0, 1, 3], [0, 1, 3])]
     unit = said.unit("length") or source.length
     if said.spacing or affine is None:
         spacing = _spacing(source, said, dimension)

@@ -23,6 +23,8 @@ from .registry import open_source
 from .source import FormatError, Source
 from .walls import inside_at, wall_from_files, wall_from_mask
 
+ORDERS = ("zyx", "xyz", "yxz", "zxy", "xzy", "yzx")
+
 
 @dataclass(frozen=True)
 class WallOptions:
@@ -140,26 +142,28 @@ def _ordered(source: Source, said: FieldMap) -> Fields:
     """Assembled; with `axes="auto"` in the order of axes that has the least divergence."""
     if isinstance(said.time, float):
         said = replace(said, time=(said.time,))
-    fields = assemble(source, said)
     if said.axes != "auto":
-        return fields
-    bare = Wall(np.eye(4, 3), np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]]), np.zeros(4))
+        return assemble(source, said)
+    # Spacings belong to x, y, z, so that each order is another field: all are tried, and only their scores kept.
+    scores = {axes: _divergence(source, replace(said, axes=axes)) for axes in ORDERS}
+    axes = min(scores, key=lambda one: scores[one])
+    if scores["zyx"] <= FACTOR * scores[axes]:
+        axes = "zyx"
+    fields = assemble(source, replace(said, axes=axes))
+    rest = ", ".join(f"{one} {score:.2g}" for one, score in scores.items() if one != axes)
+    fields.notes.append(f"axes taken as {axes}: divergence {scores[axes]:.2g} of the gradient ({rest})")
+    return fields
+
+
+def _divergence(source: Source, said: FieldMap) -> float:
+    """The RMS of the divergence relative to that of the gradient."""
+    fields = assemble(source, said)
     mask = fields.mask if fields.mask is not None else np.isfinite(fields.velocity).all(axis=1)
-    trial = Recording(fields.time, fields.grid, np.nan_to_num(fields.velocity), mask, bare, 1060.0, 0.0)
-    found = best_order(trial)
+    bare = Wall(np.eye(4, 3), np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]]), np.zeros(4))
+    found = best_order(Recording(fields.time, fields.grid, np.nan_to_num(fields.velocity), mask, bare, 1060.0, 0.0))
     if found is None:
         raise FormatError(f"{source.path}: too little is measured to find the order of axes; say it (--axes zyx)")
-    order, claimed, best = found
-    if claimed <= FACTOR * best or "-" in order:
-        fields.notes.append(
-            f"axes taken as zyx: divergence {claimed:.2g} of the gradient, in the best order {best:.2g}"
-        )
-        return fields
-    renamed = dict(zip(order.split(","), "xyz", strict=True))
-    axes = "".join(renamed[letter] for letter in "zyx")
-    fields = assemble(source, replace(said, axes=axes))
-    fields.notes.append(f"axes taken as {axes}: divergence {best:.2g} of the gradient, as zyx {claimed:.2g}")
-    return fields
+    return found[1]
 
 
 def _merged(sources: Sequence[Source], said: FieldMap) -> Source | None:
