@@ -80,8 +80,10 @@ def lsqr(
 
     ``matvec`` and ``rmatvec`` apply the UNWEIGHTED matrix and its adjoint in whatever precision they are
     handed (b's for the iteration, float64 for the check); ``weight`` (rows,) multiplies rows as in
-    Grønli 2017, eqs. 3.24 and 3.25. Raises NotConverged, unless ``strict`` is False, when the true relative gradient stays
-    above ``tolerance``.
+    Grønli 2017, eqs. 3.24 and 3.25.
+
+    Raises:
+        NotConverged: when the true relative gradient stays above ``tolerance``, unless ``strict`` is False.
     """
     limits = Limits(tolerance, max_iterations, strict)
     return iterate("lsqr", _run, matvec, rmatvec, b, weight, damping, limits)
