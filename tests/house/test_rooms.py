@@ -13,7 +13,7 @@ from source import PACKAGES, Imports, Module, modules, native_sources
 FLOORS = (
     ("geometry", "regularize"),
     ("torchsph.assimilation", "torchsph.native", "torchsph.data"),
-    ("torchsph.pairs", "torchsph.ultrasound", "torchsph.evaluation"),
+    ("torchsph.pairs", "torchsph.ultrasound", "torchsph.evaluation", "torchsph.haemodynamics"),
     ("torchsph.simulator",),
     ("torchsph.methods", "torchsph.validation"),
     ("torchsph.cli",),
