@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from geometry import WallMotion
-from torchsph.pairs import backend as choose_backend
+from torchsph.pairs import choose_backend
 from torchsph.pairs.interface import PairState, RateTerms, Support
 from torchsph.pairs.smoothing_kernels import kernel
 

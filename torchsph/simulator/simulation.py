@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from geometry import Grid
-from torchsph.pairs import backend as choose_backend
+from torchsph.pairs import choose_backend
 
 from .imposing import Fetched, fetch_at, pulled
 from .population import Population

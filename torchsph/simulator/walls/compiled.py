@@ -12,7 +12,8 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
-from torchsph.native.library import REALS, LibraryMissing, WallArguments, address, library
+from torchsph.native.library import REALS, LibraryMissing, address, library
+from torchsph.native.structures import WallArguments
 from torchsph.pairs.interface import PRESSURE_FORMS, per_particle
 
 from .forces import SMALLEST_FRICTION_DISTANCE, SMALLEST_SHARE, WallSample, completed, friction, wall_pressure_force

@@ -12,7 +12,7 @@ from torchsph.native.library import LibraryMissing, library
 
 from .compiled import CompiledBackend
 from .correlation import KernelShape
-from .reference import ReferenceBackend
+from .reference import TorchBackend
 
 NAMES = ("auto", "cpu", "reference")
 
@@ -70,7 +70,7 @@ def backend(name: str = "auto", device: torch.device | str = "cpu") -> Backend:
     if name not in NAMES:
         raise ValueError(f"unknown tracking backend {name!r}; known: {', '.join(NAMES)}")
     if name == "reference":
-        return ReferenceBackend()
+        return TorchBackend()
     problem = None
     if torch.device(device).type != "cpu":
         problem = f"works on CPU tensors only, the packet is on '{device}'"
@@ -83,4 +83,4 @@ def backend(name: str = "auto", device: torch.device | str = "cpu") -> Backend:
         return CompiledBackend()
     if name == "cpu":
         raise ValueError(f"tracking backend 'cpu' was asked for and cannot be used: {problem}")
-    return ReferenceBackend()
+    return TorchBackend()

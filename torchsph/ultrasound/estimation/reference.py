@@ -12,7 +12,7 @@ from .box_sums import box_sum, power
 from .correlation import KernelShape, correlate, gather
 
 
-class ReferenceBackend:
+class TorchBackend:
     """See :class:`~torchsph.ultrasound.backends.Backend`."""
 
     name = "reference"
