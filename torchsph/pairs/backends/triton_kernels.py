@@ -10,6 +10,8 @@ of one register for each of ``terms.OUTPUTS``; those that a pass does not fill n
 drops them from its loops.
 """
 
+# mypy: allow-untyped-defs, allow-incomplete-defs
+# (the language of Triton has no types)
 from __future__ import annotations
 
 import triton

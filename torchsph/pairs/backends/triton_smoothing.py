@@ -1,5 +1,7 @@
 """The smoothing kernels in Triton: the formulas of csrc/smoothing.hpp, chosen when a kernel is compiled."""
 
+# mypy: allow-untyped-defs, allow-incomplete-defs
+# (the language of Triton has no types)
 from __future__ import annotations
 
 import triton
