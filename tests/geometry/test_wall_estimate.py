@@ -63,7 +63,8 @@ def test_flicker_is_found_and_most_of_it_taken_out(kind, period):
         z.append(rms((estimate.rate - rate) / estimate.rate_sigma))
     assert rms(left) < 0.65 * rms(given)  # a spline with a third of the frames as its freedom leaves .58
     assert rms(left) == pytest.approx(rms(told), rel=0.35)
-    assert rms(rates) < 0.35 * rms(before)
+    # errors of single vertices cancel in the volume; those that all share do not
+    assert rms(rates) < (0.35 if kind == "scaling" else 1.0) * rms(before)
     if kind == "scaling":
         assert 0.5 < rms(z) < 1.8
 

@@ -31,7 +31,7 @@ from scipy.ndimage import generate_binary_structure, label
 
 import geometry
 
-from .sampling import PlaneSection
+from .fields.sampling import PlaneSection
 
 __all__ = ["PlaneVortex", "VortexRing", "main_vortex", "vortex_cores", "vortex_ring"]
 
