@@ -280,12 +280,14 @@ def _scalar(source: Source, said: FieldMap, name: str, lie: Orientation, frames:
 
 def _time(source: Source, said: FieldMap, frames: int) -> np.ndarray:
     unit = said.unit("time") or 1.0
+    time: np.ndarray
     if isinstance(said.time, tuple) and said.time:
         time = np.asarray(said.time, np.float64) * unit
     elif said.time:
-        if said.time not in source.arrays:
-            raise FormatError(f"{source.path}: has no array {said.time} of times")
-        time = np.asarray(source.arrays[said.time][(...,)], np.float64).reshape(-1) * unit
+        name = str(said.time)
+        if name not in source.arrays:
+            raise FormatError(f"{source.path}: has no array {name} of times")
+        time = np.asarray(source.arrays[name][(...,)], np.float64).reshape(-1) * unit
     elif said.interval is not None:
         time = said.interval * np.arange(frames)
     elif source.time is not None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -52,6 +52,15 @@ class WallOptions:
 
 
 @dataclass(frozen=True)
+class _Constants:
+    """kg/m^3, Pa s and s of the recording to be made."""
+
+    rho: float
+    mu: float
+    period: float
+
+
+@dataclass(frozen=True)
 class Converted:
     """A recording, and what its user should know of how it was made."""
 
@@ -93,7 +102,7 @@ def convert(
     missing = [path for path in (*paths, *map(Path, wall.files)) if not path.exists()]
     if missing:
         raise FileNotFoundError(f"{missing[0]}: there is no such file")
-    about = {"rho": rho, "mu": mu, "period": said.period}
+    about = _Constants(rho, mu, said.period)
     text_of = description or f"converted from {paths[0].name}" + (
         f" and {len(paths) - 1} more" if len(paths) > 1 else ""
     )
@@ -123,7 +132,7 @@ def _fields(paths: Sequence[Path], said: FieldMap, format: str) -> Fields:
             return _ordered(together, said)
         return _joined(
             [
-                _ordered(source, replace(said, interval=None, time=0.0) if _timeless(source) else said)
+                _ordered(source, replace(said, interval=None, time=(0.0,)) if _timeless(source) else said)
                 for source in sources
             ],
             said,
@@ -140,8 +149,6 @@ def _timeless(source: Source) -> bool:
 
 def _ordered(source: Source, said: FieldMap) -> Fields:
     """Assembled; with `axes="auto"` in the order of axes that has the least divergence."""
-    if isinstance(said.time, float):
-        said = replace(said, time=(said.time,))
     if said.axes != "auto":
         return assemble(source, said)
     # Spacings belong to x, y, z, so that each order is another field: all are tried, and only their scores kept.
@@ -222,13 +229,16 @@ def _joined(parts: Sequence[Fields], said: FieldMap, names: Sequence[str]) -> Fi
             raise FormatError(f"{names[0]}: when were the {len(time)} frames? Say it (--interval S or --period S)")
         time = said.period * np.arange(len(time)) / len(time)
     return replace(
-        first, time=time, velocity=row("velocity"), mask=row("mask"), weight=row("weight"), sigma=row("sigma")
+        first,
+        time=time,
+        velocity=np.concatenate([part.velocity for part in parts]),
+        mask=row("mask"),
+        weight=row("weight"),
+        sigma=row("sigma"),
     )
 
 
-def _walled(
-    fields: Fields, said: FieldMap, options: WallOptions, about: Mapping[str, float], description: str
-) -> Converted:
+def _walled(fields: Fields, said: FieldMap, options: WallOptions, about: _Constants, description: str) -> Converted:
     """A recording of the fields between a wall from files, or one around the mask."""
     notes, grid, velocity, mask = list(fields.notes), fields.grid, fields.velocity, fields.mask
     known = np.isfinite(velocity).all(axis=1)
@@ -270,13 +280,15 @@ def _walled(
         description=description + "".join(f"; {note}" for note in fields.notes),
         weight=weight,
         sigma=fields.sigma,
-        **about,
+        rho=about.rho,
+        mu=about.mu,
+        period=about.period,
     )
     return Converted(recording, tuple(notes))
 
 
 def _walls_alone(
-    paths: Sequence[Path], said: FieldMap, options: WallOptions, about: Mapping[str, float], description: str
+    paths: Sequence[Path], said: FieldMap, options: WallOptions, about: _Constants, description: str
 ) -> Converted:
     """A recording of a wall in which nothing was measured: velocity 0 at weight 0."""
     if said.grid_spacing is None:
@@ -301,7 +313,9 @@ def _walls_alone(
         wall,
         description=f"{description}; walls alone, nothing measured",
         weight=np.zeros(mask.shape),
-        **about,
+        rho=about.rho,
+        mu=about.mu,
+        period=about.period,
     )
     volume = [wall.at(frame).volume for frame in range(count)] if wall.moves else [wall.at(0).volume]
     return Converted(recording, (f"walls alone, {1e6 * min(volume):.4g} to {1e6 * max(volume):.4g} ml; weight 0",))

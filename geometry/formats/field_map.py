@@ -47,7 +47,7 @@ class FieldMap:
     mask_label: float | None = None
     weight: str = ""
     sigma: tuple[str, ...] = ()
-    time: str | float | tuple[float, ...] = ""
+    time: str | tuple[float, ...] = ""
     axes: str = ""
     components: str = ""
     image_components: bool = False

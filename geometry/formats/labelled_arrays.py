@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -51,7 +51,9 @@ def to_xarray(recording: Recording) -> xarray.Dataset:
         axis: grid.origin[number] + grid.spacing[number] * np.arange(grid.shape[-1 - number])
         for number, axis in enumerate("xyz"[: recording.dimension])
     }
-    coordinates = {axis: (axis, values, {"units": "m", "axis": axis.upper()}) for axis, values in places.items()}
+    coordinates: dict[str, tuple] = {
+        axis: (axis, values, {"units": "m", "axis": axis.upper()}) for axis, values in places.items()
+    }
     coordinates["time"] = ("time", recording.time, {"units": "s", "axis": "T", "long_name": "time in the beat"})
     coordinates["component"] = ("component", list("xyz"[: recording.dimension]), {})
     about = {name: getattr(recording, name) for name in ("rho", "mu", "period", "description")}
@@ -81,8 +83,8 @@ def from_xarray(dataset: xarray.Dataset) -> Recording:
     wall = {name[5:]: array for name, array in values.items() if name.startswith("wall.")}
     rest = {name: array for name, array in values.items() if not name.startswith("wall.")}
     about = {name: dataset.attrs[name] for name in ("rho", "mu", "period", "description") if name in dataset.attrs}
-    made = {} if not wall else {"wall": Wall(**wall)}
-    return Recording(grid=_grid(dataset, dimension), **rest, **about, **made)
+    whole: dict[str, Any] = {**rest, **about, **({"wall": Wall(**wall)} if wall else {})}
+    return Recording(grid=_grid(dataset, dimension), **whole)
 
 
 def _named(name: str, dimension: int, present: tuple) -> tuple:

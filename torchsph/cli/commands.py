@@ -327,7 +327,7 @@ def _say(message: str) -> None:
     print(message, file=sys.stderr)
 
 
-COMMANDS = {
+COMMANDS: dict[str, Callable[[argparse.Namespace], None]] = {
     "assimilate": assimilate,
     "forecast": forecast,
     "measure": measure,

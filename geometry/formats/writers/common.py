@@ -40,7 +40,7 @@ def lattice(recording: Recording) -> tuple[np.ndarray, np.ndarray, tuple[int, in
     flat = recording.dimension == 2
     origin = np.array([*grid.origin, *([0.0] if flat else [])])
     spacing = np.array([*grid.spacing, *([max(grid.spacing)] if flat else [])])
-    nx, ny, nz = (*reversed(grid.shape), *((1,) if flat else ()))
+    nz, ny, nx = (1, *grid.shape) if flat else grid.shape
     return origin, spacing, (nx, ny, nz)
 
 

@@ -26,7 +26,9 @@ def write_matlab(path: Path, recording: Recording) -> list[Path]:
     content["units"] = "x, y, z: m; t: s; u, v, w, sigma: m/s; pressure: Pa; arrays run (x, y, z, t)"
     for name in VECTORS:
         field = vector(recording, name)
-        for component in range(3 if field is not None else 0):
+        if field is None:
+            continue
+        for component in range(3):
             label = "uvw"[component] if name == "velocity" else f"{name}_{'xyz'[component]}"
             content[label] = field[:, component].transpose(3, 2, 1, 0)
     for name in SCALARS:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -11,8 +12,8 @@ from geometry.recordings.recording import Recording
 
 def write_npz(path: Path, recording: Recording) -> list[Path]:
     """`velocity`, `mask`, `time`, `wall_vertices`, ...; `origin` and `spacing` along x, y, z."""
-    arrays = {name.strip("/").replace("/", "_"): values for name, values in recording.arrays().items()}
-    numbers = {name: np.float64(getattr(recording, name)) for name in ("rho", "mu", "period")}
-    grid = {"origin": np.array(recording.grid.origin), "spacing": np.array(recording.grid.spacing)}
-    np.savez_compressed(path, **arrays, **numbers, **grid)
+    content: dict[str, Any] = {name.strip("/").replace("/", "_"): values for name, values in recording.arrays().items()}
+    content |= {name: np.float64(getattr(recording, name)) for name in ("rho", "mu", "period")}
+    content |= {"origin": np.array(recording.grid.origin), "spacing": np.array(recording.grid.spacing)}
+    np.savez_compressed(path, **content)
     return [path]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -11,6 +12,10 @@ from geometry.formats.source import missing_extra
 from geometry.recordings.recording import Recording
 
 from .common import SCALARS, VECTORS, lattice, scalar, vector, wall_velocity
+
+if TYPE_CHECKING:
+    from vtkmodules.vtkCommonDataModel import vtkDataObject
+    from vtkmodules.vtkIOXML import vtkXMLWriter
 
 
 def write_vti(path: Path, recording: Recording) -> list[Path]:
@@ -25,8 +30,8 @@ def write_vti(path: Path, recording: Recording) -> list[Path]:
     names = []
     for frame in range(recording.frames):
         image = vtkImageData()
-        image.SetOrigin(origin)
-        image.SetSpacing(spacing)
+        image.SetOrigin(origin.tolist())
+        image.SetSpacing(spacing.tolist())
         image.SetDimensions(counts)
         for name in (*VECTORS, *SCALARS):
             whole = vector(recording, name) if name in VECTORS else scalar(recording, name)
@@ -74,7 +79,7 @@ def _walls(path: Path, recording: Recording) -> list[Path]:
     return [_series(path.with_name(f"{path.stem}_wall.vtp.series"), names, recording.time), *names]
 
 
-def _write(writer, data, path: Path) -> None:
+def _write(writer: vtkXMLWriter, data: vtkDataObject, path: Path) -> None:
     writer.SetFileName(str(path))
     writer.SetInputData(data)
     if writer.Write() != 1:
