@@ -12,7 +12,7 @@ from typing import NoReturn
 
 from torchsph import __version__
 
-from . import convert
+from . import convert, export
 
 __all__ = ["OUT", "build_parser"]
 
@@ -40,6 +40,7 @@ def build_parser(commands: dict[str, Callable[[argparse.Namespace], None]], pres
         ("quantify", _quantify),
         ("info", _info),
         ("convert", convert.describe),
+        ("export", export.describe),
     ):
         text = (describe.__doc__ or "").strip()
         sub = subparsers.add_parser(name, help=text.splitlines()[0], description=text)

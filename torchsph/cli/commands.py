@@ -25,6 +25,7 @@ from torchsph.methods.runtime import parallel
 
 from .arguments import LEADS
 from .convert import convert
+from .export import export
 from .findings import tell_findings
 from .outputs import output_folder, staged, write_json
 from .quantify import quantify
@@ -326,7 +327,7 @@ def _say(message: str) -> None:
     print(message, file=sys.stderr)
 
 
-COMMANDS = {
+COMMANDS: dict[str, Callable[[argparse.Namespace], None]] = {
     "assimilate": assimilate,
     "forecast": forecast,
     "measure": measure,
@@ -334,4 +335,5 @@ COMMANDS = {
     "quantify": quantify,
     "info": info,
     "convert": convert,
+    "export": export,
 }

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from dataclasses import fields, replace
+from typing import Any
 
 import geometry
 from geometry.formats import FORMATS, FieldMap, WallOptions, read_field_map
@@ -82,9 +83,9 @@ def convert(args: argparse.Namespace) -> None:
     print(f"wrote {result.recording.frames} frames to {args.out}", file=sys.stderr)
 
 
-def _given(args: argparse.Namespace) -> dict[str, object]:
+def _given(args: argparse.Namespace) -> dict[str, Any]:
     """The options of the field map that were given, in its types."""
-    found: dict[str, object] = {}
+    found: dict[str, Any] = {}
     for item in fields(FieldMap):
         value = getattr(args, item.name)
         if value is None:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import geometry
-from torchsph._version import __version__
+from torchsph import __version__
 from torchsph.evaluation.metrics import filled_velocity, matching_frames
 from torchsph.haemodynamics.beat import BEAT_UNITS, beat_numbers
 from torchsph.haemodynamics.quantities import UNITS, FlowDomain, flow_quantities

@@ -15,7 +15,6 @@ import torch
 from torch import Tensor
 
 from ..state.clock import Clock
-from ..state.particles import CHANNEL, RESERVOIR, Particles
 from .openings import OpeningPlane, Openings
 
 # an opening that carries nothing takes this part, by its area, in what the others carry: so that none divides by nought
@@ -52,37 +51,6 @@ def _parts(flux: Tensor, areas: Tensor) -> Tensor:
     carried = size + _LEAST * size.sum(1, keepdim=True) * by_area
     total = carried.sum(1, keepdim=True)
     return torch.where(total > 0, carried / total.clamp_min(torch.finfo(flux.dtype).tiny), by_area)
-
-
-def fluxes_of_field(velocity: Tensor, free: list[tuple[int, OpeningPlane]]) -> Tensor:
-    """Fluxes inwards (members, openings) of a field.
-
-    Args:
-        velocity: (members, n, D), at the openings' quadrature points, one opening after the other.
-        free: number and plane of each opening.
-    """
-    counts = [len(plane.quadrature()) for _, plane in free]
-    read = [
-        -plane.area * ((part - plane.velocity) @ plane.normal).mean(1)
-        for (_, plane), part in zip(free, velocity.split(counts, dim=1), strict=True)
-    ]
-    return torch.stack(read, 1)
-
-
-def fluxes_of_buffers(particles: Particles, free: list[tuple[int, OpeningPlane]]) -> Tensor | None:
-    """Fluxes inwards (members, openings) by the mean velocities of the buffers.
-
-    None where there is nothing to share, or an opening has no buffer.
-    """
-    behind = [(particles.kind == RESERVOIR + n) | (particles.kind == CHANNEL - n) for n, _ in free]
-    if len(free) < 2 or not all(bool(buffer.any()) for buffer in behind):
-        return None
-    read = []
-    for (_, plane), buffer in zip(free, behind, strict=True):
-        along = torch.where(buffer, ((particles.velocity - plane.velocity) * plane.normal).sum(1), 0.0)
-        count = particles.per_member(buffer.to(along.dtype), "sum").clamp_min(1.0)
-        read.append(-plane.area * particles.per_member(along, "sum") / count)
-    return torch.stack(read, 1)
 
 
 def takers(openings: Openings, active: list[tuple[int, OpeningPlane]]) -> list[tuple[int, OpeningPlane]]:

@@ -23,16 +23,15 @@ from ..state.record import Record
 from .accounts import note_passed
 from .buffer_flow import AREA_TRUST, mean_near, scaled_profile, volume_of_rows, with_channel_flux
 from .cavity_volume import CavityVolume
-from .flux_split import FluxSplit, fluxes, fluxes_of_buffers, fluxes_of_field, takers
+from .flux_split import fluxes, takers
 from .model import Pressure, ValveModel, ValveSetting
 from .openings import OpeningPlane, Openings
 from .pressure_reservoirs import PressureReservoirs
+from .shared_flux import MOUTH, SharedFlux
 from .volume_match import levelled, volume_inside
 
 # how far beyond the plane (spacings) an outgoing particle changes to buffer, and an incoming one to fluid
 _HYSTERESIS = 0.25
-# depth inside the orifice (spacings) at which the profile of an imposed field is read
-_MOUTH = 0.5
 
 
 class Reservoirs(ValveModel):
@@ -59,6 +58,7 @@ class Reservoirs(ValveModel):
             setting.device,
             setting.dtype,
         )
+        self._shared = SharedFlux(self.openings, self.volume)
         self.takes_strength = bool(self.openings.given)
 
     def pressure_reservoirs(self, backend: Backend) -> PressureReservoirs | None:
@@ -99,31 +99,12 @@ class Reservoirs(ValveModel):
         return self._run_out if float(through) < 0.0 else 0.0
 
     def split_points(self, clock: Clock) -> Tensor | None:
-        """Points (n, D) just inside openings that share what they pass, where their fluxes are read; None: none do."""
-        free = takers(self.openings, self.openings.active(clock))
-        if len(free) < 2:
-            return None
-        return torch.cat([plane.quadrature() - _MOUTH * plane.normal for _, plane in free])
+        """See ``SharedFlux.points``."""
+        return self._shared.points(clock)
 
     def note_split(self, velocity: Tensor, clock: Clock) -> None:
-        """Read how openings share what they pass off a field (members, n, D) at their ``split_points``."""
-        free = takers(self.openings, self.openings.active(clock))
-        self._keep_split(fluxes_of_field(velocity, free), free, clock)
-
-    def _keep_split(self, read: Tensor, free: list[tuple[int, OpeningPlane]], clock: Clock) -> None:
-        """Keep fluxes (members, n) that were read of some openings, brought to sum to what they pass together."""
-        numbers = tuple(n for n, _ in free)
-        found = fluxes(self.openings, clock, self.volume.rate(clock.of_members(len(read))))
-        total = torch.stack([found[n] for n in numbers]).sum(0)
-        areas = total.new_tensor([plane.area for _, plane in free])
-        clock.flux_split = FluxSplit.balanced(numbers, read, areas, total)
-
-    def _read_buffers(self, particles: Particles, clock: Clock) -> None:
-        """Read how openings share what they pass off the velocities of their buffers, where a run goes on."""
-        free = takers(self.openings, self.openings.active(clock))
-        read = fluxes_of_buffers(particles, free)
-        if read is not None:
-            self._keep_split(read, free, clock)
+        """See ``SharedFlux.read_field``."""
+        self._shared.read_field(velocity, clock)
 
     def opened(self, particles: Particles, clock: Clock) -> Particles:
         """Make the buffers of valves that are open and have none, drop those of valves that have shut."""
@@ -133,7 +114,7 @@ class Reservoirs(ValveModel):
             stay = ~torch.isin(particles.kind, kind)
             particles = particles if bool(stay.all()) else particles.select(stay)
         if clock.flux_split is None:
-            self._read_buffers(particles, clock)
+            self._shared.read_buffers(particles, clock)
         for number, plane in self.openings.active(clock):
             has = particles.per_member((particles.kind == RESERVOIR + number).to(torch.int64), "sum") > 0
             empty = torch.nonzero(~has).squeeze(1)
@@ -289,7 +270,7 @@ class Reservoirs(ValveModel):
         points = particles.position
         for number, plane in self.openings.active(clock):
             height = plane.height(points)
-            inward = (-height - _MOUTH)[:, None] * plane.normal
+            inward = (-height - MOUTH)[:, None] * plane.normal
             behind = (particles.kind == RESERVOIR + number) | (particles.kind == CHANNEL - number)
             points = torch.where(behind[:, None], points + inward, points)
         return points
