@@ -47,8 +47,13 @@ class GridForecast:
     """A forecast on its way: starts from velocity grids of all members, gives velocity grids at later times.
 
     Args:
-        model: the simulator. grid, mask (*shape) bool: where the velocity is known at ``time`` (s).
+        model: the simulator.
+        grid: the nodes, m.
         velocity: (D, *shape) for one member or (members, D, *shape), m/s.
+        mask: (*shape) bool, where it is known.
+        time: s.
+        transfer: between grid and particles.
+        seed: of the particles.
 
     Attributes:
         run: the simulation.
@@ -99,7 +104,8 @@ class ForecastSkill:
 
     Attributes:
         leads: one entry per lead: ``{"lead": s, "starts": n, "nrmse": {"model": x, "persistence": y}}``.
-        seconds: ``{"setup": s, "forecast": s}``. config: what was run.
+        seconds: ``{"setup": s, "forecast": s}``.
+        config: what was run.
         recordings: the forecasts of each lead, valid at their time; empty unless they were asked for.
         info: accounts of the runs.
     """
@@ -150,7 +156,18 @@ def skill(
     Errors are pooled over all starts and over all nodes inside both masks; uncovered nodes count as zero velocity.
     A recording with ``weight`` is noisy: ``transfer`` then defaults to the plain fetch.
 
-    Raises ValueError where no frame lies a lead after a start.
+    Args:
+        recording: what is forecast, and what forecasts are compared with.
+        model: the simulator.
+        leads: s.
+        every: frames from one start to the next.
+        transfer: between grid and particles; None: as above.
+        save: whether the forecasts are kept.
+        progress: whether a bar shows how far it is.
+        seed: of the particles.
+
+    Raises:
+        ValueError: no frame lies a lead after a start.
     """
     if transfer is None:
         transfer = Transfer() if recording.weight is None else Transfer(fade=None)

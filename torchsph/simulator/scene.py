@@ -110,8 +110,11 @@ class Valve:
     def pressure_at(self, time: float) -> float:
         """The given pressure (Pa) at ``time`` (s).
 
-        Raises ValueError where it is not finite.
+        Raises:
+            ValueError: it is not finite, or none is given.
         """
+        if self.pressure is None:
+            raise ValueError(f"valve of region {self.region} has no given pressure")
         value = float(self.pressure(time) if callable(self.pressure) else self.pressure)
         if not math.isfinite(value):
             raise ValueError(f"Valve.pressure of region {self.region} must be finite (Pa), got {value} at {time:g} s")
@@ -196,7 +199,8 @@ class Scene:
     def gravity_at(self, time: float) -> tuple[float, ...]:
         """The body force per mass (D,), m/s^2, at ``time`` (s).
 
-        Raises ValueError where a function of time returns anything but D finite numbers.
+        Raises:
+            ValueError: a function of time returns anything but D finite numbers.
         """
         if not callable(self.gravity):
             return (0.0,) * self.dimension if self.gravity is None else tuple(self.gravity)

@@ -1,8 +1,8 @@
 """From grids to particles: velocities at points by moving least squares over the nodes around, and beyond a mask.
 
 First order with a compact weight, gathered by the receiving side only, so that linear fields are reproduced exactly
-wherever the neighbourhood is not degenerate (the thesis's symmetric form overshoots; section 5.1 of the thesis asks for
-this cure). The way back is ``pairs.moving_least_squares.fetch_at``.
+wherever the neighbourhood is not degenerate (the symmetric form of Grønli 2017 overshoots; sec. 5.1 there asks for this
+cure). The way back is ``pairs.moving_least_squares.fetch_at``.
 """
 
 from __future__ import annotations

@@ -100,7 +100,9 @@ class Openings:
     """All openings of a scene's valves; a region may consist of several.
 
     Attributes:
-        all: the orifices. valve_of: of each opening, the number of its valve. valves: those of the scene.
+        all: the orifices.
+        valve_of: of each opening, the number of its valve.
+        valves: those of the scene.
         given: numbers of the openings at a given pressure.
     """
 
