@@ -14,11 +14,9 @@ from torch import Tensor
 from tqdm import tqdm
 
 import geometry
+from torchsph.evaluation.metrics import SAME_TIME
 
 from .simulator import Simulation, Simulator
-
-# frames count as the wanted lead within this (s); the files carry float64 seconds
-SAME_TIME = 1e-6
 
 
 @dataclass(frozen=True)
@@ -94,8 +92,8 @@ class GridForecast:
         found = self.run.fetch(self.grid, mask)
         if self._lost is None or self.transfer.fade is None:
             return found.value, found.covered
-        share = math.exp(-(time - self.start_time) / self.transfer.fade)
-        return found.value + share * self._lost * found.covered[:, None], found.covered
+        fading = math.exp(-(time - self.start_time) / self.transfer.fade)
+        return found.value + fading * self._lost * found.covered[:, None], found.covered
 
 
 @dataclass(frozen=True)
@@ -244,7 +242,7 @@ def _from_one_start(
 def _as_recording(recording: geometry.Recording, frames: list, lead: float) -> geometry.Recording:
     chosen = recording.select(np.array([frame for frame, _, _ in frames]))
     return chosen.with_velocity(
-        np.stack([one for _, one, _ in frames]),
+        np.stack([velocity for _, velocity, _ in frames]),
         uncovered=np.array([n for _, _, n in frames], np.int64),
         description=f"forecast {1e3 * lead:g} ms ahead",
     )

@@ -28,7 +28,8 @@ class WeaklyCompressible(Scheme):
         gamma: exponent of the Tait equation (Grønli 2017, eq. 2.25).
         gamma_ramp: how gamma grows after an imposition, or None.
         background_pressure: p0 / rho0 in units of c^2 (0: none).
-        hughes_graham: whether the Tait pressure is taken at max(rho, rho0) (Hughes & Graham 2010): the fluid cannot pull.
+        hughes_graham: whether the Tait pressure is taken at max(rho, rho0) (Hughes & Graham 2010), which
+            cannot pull.
         continuity: "volume" or "mass" (Grønli 2017, eq. 2.19) form of the density rate.
         pressure: form of the pressure force (``MomentumTerms``).
         artificial_viscosity: alpha (Grønli 2017, eq. 2.29), or None.
@@ -46,12 +47,12 @@ class WeaklyCompressible(Scheme):
         valve: valve model for scenes with valves; they stay shut with None.
         shifting_speed: the speed in the shifting: "local" (the particle's own) or "largest" (of its member: also
             stagnation points are evened out, which a vortex needs and a jet in a resting chamber does not).
-        shifting_surface: h times the concentration gradient above which a particle counts as one of a free surface and is
-            not shifted, or None: all are.
+        shifting_surface: h times the concentration gradient above which a particle counts as one of a free surface and
+            is not shifted, or None: all are.
         tensile: R of Monaghan's tensile correction (2000; 0.2 there, symmetric pressure form only), or None.
-        order: "thesis" steps as Grønli 2017, algorithm 1; "symplectic" evaluates both passes at one position (symplectic Euler);
-            "verlet" is the position Verlet scheme, "predictor_corrector" the symplectic predictor-corrector, both of
-            second order (``stepping.time_schemes``).
+        order: "thesis" steps as Grønli 2017, algorithm 1; "symplectic" evaluates both passes at one position (symplectic
+            Euler); "verlet" is the position Verlet scheme, "predictor_corrector" the symplectic predictor-corrector,
+            both of second order (``stepping.time_schemes``).
         courant: fraction of the acoustic limit h / (c + v), of h^2/(8 nu) and of sqrt(h / |a|) / 2.
         constant_volume: the fluid fills a volume that never changes (a periodic box, or walls without openings that
             enclose the same volume all the time): its mean density is held, which wanders by percents otherwise.
