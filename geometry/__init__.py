@@ -6,6 +6,7 @@ from .motion.orifices import Orifice, OrificePlane, orifices
 from .motion.refine import refined, refined_motion
 from .motion.wall_motion import WallMotion
 from .motion.wall_points import WallPoints, WallSampler, wall_points
+from .recordings.measurement_types import MeasurementType, measurement_type
 from .recordings.read import read_recording
 from .recordings.recording import Recording, Wall
 from .recordings.rules import RecordingError
@@ -25,6 +26,7 @@ __all__ = [
     "Closest",
     "Grid",
     "GridDistance",
+    "MeasurementType",
     "MovingDistance",
     "Orifice",
     "OrificePlane",
@@ -47,6 +49,7 @@ __all__ = [
     "ellipsoid",
     "grid_winding",
     "labelled",
+    "measurement_type",
     "orifices",
     "polygon",
     "read_recording",

@@ -8,11 +8,13 @@ from ._version import __version__
 from .methods.by_name import DEFAULT_METHOD, METHODS, MethodResult, forecast_skill, make_model, run_methods
 from .methods.ensemble.assimilate import EnsembleRun, assimilate, default_filter
 from .methods.ensemble.options import EnsembleOptions, Estimated
-from .methods.frame_splines import smooth
+from .methods.forecast_skill import ForecastSkill, skill
 from .methods.measurement.error_model import ObservationError, estimate_error
+from .methods.measurement.frame_splines import smooth
+from .methods.measurement.prepared import PreparedMeasurement
 from .methods.nudging import FilteredRun, filter_sph
 from .pairs.smoothing_kernels import KERNELS, SmoothingKernel, kernel
-from .simulator.grid_forecast import ForecastSkill, GridForecast, Transfer, skill
+from .simulator.grid_forecast import GridForecast, Transfer
 from .simulator.population import PopulationControl
 from .simulator.scene import Fluid, Scene, Valve
 from .simulator.schemes.presets import PRESETS, preset
@@ -51,6 +53,7 @@ __all__ = [
     "ObservationError",
     "PopulationControl",
     "PotentialWall",
+    "PreparedMeasurement",
     "PressureSource",
     "Projection",
     "Reservoir",

@@ -20,8 +20,9 @@ from torchsph._version import __version__
 from torchsph.assimilation import filter_figure
 from torchsph.evaluation import figures as report
 from torchsph.evaluation import metrics
+from torchsph.evaluation.frames import SAME_TIME
 from torchsph.methods import by_name as pipeline
-from torchsph.methods.frame_splines import smooth as smooth_recording
+from torchsph.methods.measurement.frame_splines import smooth as smooth_recording
 from torchsph.methods.runtime import parallel
 
 from .arguments import LEADS
@@ -161,9 +162,9 @@ def _leads_within(leads: Sequence[float] | None, recording: geometry.Recording, 
     time = np.asarray(recording.time)
     later = time[None, :] - time[::every, None]
     wanted = LEADS if leads is None else leads
-    usable = tuple(lead for lead in wanted if (np.abs(later - lead) < metrics.SAME_TIME).any())
+    usable = tuple(lead for lead in wanted if (np.abs(later - lead) < SAME_TIME).any())
     missing = [f"{lead:g}" for lead in wanted if lead not in usable]
-    possible = np.unique(later[later > metrics.SAME_TIME].round(9))
+    possible = np.unique(later[later > SAME_TIME].round(9))
     if missing and (leads is not None or not usable):
         listed = ", ".join(f"{lead:g}" for lead in possible[:6]) + (", ..." if len(possible) > 6 else "")
         raise ValueError(
@@ -193,7 +194,7 @@ def measure(args: argparse.Namespace) -> None:
     true = geometry.read_recording(args.true)
     measured = make(true, kind(**given), args.seed)
     geometry.write_recording(path, measured)
-    if measured.beam is None:
+    if geometry.measurement_type(measured).full:
         _print_table(report.scores_table({"raw": metrics.evaluate(measured, true)}, {}))
     _say(f"wrote {len(measured.time)} frames to {path}")
 
@@ -264,7 +265,7 @@ def _rms(values: np.ndarray) -> float:
 
 
 def _full_vectors(recording: geometry.Recording, path: str | Path) -> geometry.Recording:
-    if recording.beam is not None:
+    if not geometry.measurement_type(recording).full:
         raise ValueError(
             f"{path}: /beam: holds one component along a beam (Doppler); the methods need full vectors, as "
             "speckle tracking or vector Doppler give them"

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 import torch.distributed as dist
 
-_FORMAT = 2
+_FORMAT = 3
 
 
 def fingerprint(parts: Iterable[object]) -> str:
