@@ -6,6 +6,7 @@ Knows numpy, scipy and torch only; walls come in as arrays (:class:`WallRows`).
 from .basis.bspline import basis
 from .basis.knots import Knots
 from .errors import InvalidInput, NotConverged
+from .options import SplineOptions
 from .rows.operators import CellRows, DirectionRows, DivergenceRows, System, VectorRows
 from .rows.sparse import sparse_matrix, sparse_operators
 from .rows.walls import WallRows
@@ -13,10 +14,13 @@ from .smoothing.field import SplineField
 from .smoothing.sequence import WindowedField, blur_in_time, fit_windows
 from .smoothing.smoother import Smoother
 from .solvers.block import BlockFactor
-from .solvers.direct import Factor, PreparedSystem, solve_direct
-from .solvers.krylov import Solution, lsqr
+from .solvers.direct import solve_direct
+from .solvers.factor import Factor
+from .solvers.interface import LinearSolver, Solution
+from .solvers.krylov import lsqr
 from .solvers.lsmr import lsmr
 from .solvers.pcg import pcg
+from .solvers.prepared import PreparedSystem
 from .statistics.likelihood import Choice
 from .statistics.posterior import Posterior
 
@@ -29,12 +33,14 @@ __all__ = [
     "Factor",
     "InvalidInput",
     "Knots",
+    "LinearSolver",
     "NotConverged",
     "Posterior",
     "PreparedSystem",
     "Smoother",
     "Solution",
     "SplineField",
+    "SplineOptions",
     "System",
     "VectorRows",
     "WallRows",

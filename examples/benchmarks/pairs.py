@@ -29,8 +29,8 @@ import torch
 from torchsph import Fluid, Scene, Simulator, WeaklyCompressible
 from torchsph.native.library import library
 from torchsph.pairs import Backend, MomentumTerms, PairState, RateTerms, Support, available_backends, backend
-from torchsph.pairs.interface import square_length
 from torchsph.pairs.smoothing_kernels import kernel
+from torchsph.pairs.vectors import square_length
 
 LENGTH = 1.2
 SUPPORT = Support(kernel("wendland_c2"), LENGTH, 3)

@@ -23,7 +23,7 @@ OUTSIDE = ("clamp", "zero")
 class Stencil(NamedTuple):
     """The 2^D nodes around each point: flat node numbers and weights, both `(*batch, n, 2^D)`."""
 
-    index: Tensor
+    index: Tensor  # type: ignore[assignment]  # a tuple has a method of this name, which nothing here calls
     weight: Tensor
 
 

@@ -1,6 +1,6 @@
 """Signed distance, normal and velocity of a moving wall at any point and time: one look-up per particle.
 
-Grids are made at key frames and are linear in time between them (the thesis's two textures, section 3.1.2).
+Grids are made at key frames and are linear in time between them (the two textures of Grønli 2017, sec. 3.1.3).
 Each holds, for every node, the distance d (positive inside), its gradient g (unit normal INTO the fluid) and
 the velocity of the closest wall point; a blend for the current time is sampled with multilinear weights w.
 

@@ -165,7 +165,7 @@ def _differences(time: np.ndarray, vertices: np.ndarray, period: float) -> np.nd
     if len(time) < 2:
         return np.zeros_like(vertices)
     if abs(time[-1] - time[0] - period) > 1e-9 * (time[-1] - time[0]):
-        return np.gradient(vertices, time, axis=0, edge_order=min(len(time) - 1, 2))
+        return np.gradient(vertices, time, axis=0, edge_order=1 if len(time) == 2 else 2)
     time = np.concatenate([[time[-2] - period], time, [time[1] + period]])
     vertices = np.concatenate([vertices[-2:-1], vertices, vertices[1:2]])
     return np.gradient(vertices, time, axis=0)[1:-1]

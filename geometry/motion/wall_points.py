@@ -1,7 +1,7 @@
 """Points evenly on a moving wall, for equations there: position, outward normal, velocity, area, region.
 
-A triangulation has few points where the wall is flat and many where it is finely meshed (thesis, section
-5.1). Here large faces are cut and small ones gathered until there is about one point per `spacing`^2 (per
+A triangulation has few points where the wall is flat and many where it is finely meshed (Grønli 2017,
+sec. 5.1). Here large faces are cut and small ones gathered until there is about one point per `spacing`^2 (per
 `spacing` in a plane). The points are chosen once and then travel with the wall.
 """
 
@@ -91,12 +91,12 @@ def _cut(surface: Surface, spacing: float) -> tuple[np.ndarray, np.ndarray]:
     sides = np.stack([corner[:, (k + 1) % 3] - corner[:, k] for k in range(3)], axis=1)
     # With 1.8 spacings on the longest side no place is farther than a spacing from a centroid.
     cuts = np.maximum(np.ceil(np.sqrt((sides**2).sum(2)).max(1) / (1.8 * spacing) - 0.1), 1).astype(np.int64)
-    owner, weights = [], []
+    owners, weights = [], []
     for n in np.unique(cuts):
         faces, piece = np.flatnonzero(cuts == n), sub_triangles(int(n))
-        owner.append(np.repeat(faces, n * n))
+        owners.append(np.repeat(faces, n * n))
         weights.append(np.tile(piece, (len(faces), 1)))
-    return np.concatenate(owner), np.concatenate(weights)
+    return np.concatenate(owners), np.concatenate(weights)
 
 
 def _gather(surface: Surface, owner: np.ndarray, weights: np.ndarray, spacing: float) -> np.ndarray:

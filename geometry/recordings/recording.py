@@ -7,15 +7,16 @@ drops the z axis.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 
 from geometry.grids.grid import Grid
 from geometry.surfaces.surface import Surface
 
-from .rules import check, check_shapes
+from .errors import RecordingError
 
 # Field of `Recording` (after a dot: of its wall), dataset, type in memory and in the file.
 LAYOUT: tuple[tuple[str, str, type], ...] = (
@@ -38,6 +39,10 @@ LAYOUT: tuple[tuple[str, str, type], ...] = (
     ("flux_aortic", "/flux/aortic", np.float64),
 )
 REQUIRED = ("/time", "/velocity", "/mask", "/wall/vertices", "/wall/faces", "/wall/region")
+
+
+# what `Recording.check` goes through: `rules` enters itself here, because it has to know recordings
+RULES: list[Callable[[Recording, str], None]] = []
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +87,7 @@ class Recording:
     `pressure` (T, *shape) Pa; `valve_intervals` (n, 3) rows (region, opens, closes), s; `valve_open` (T, 2);
     `volume` (T,) m^3; `flux_mitral`, `flux_aortic` (T,) m^3/s, positive into the ventricle.
 
-    Raises RecordingError where shapes disagree; `check` tests every rule of the format.
+    Raises RecordingError where shapes disagree; `geometry.check_recording` tests every rule of the format.
     """
 
     time: np.ndarray
@@ -111,7 +116,7 @@ class Recording:
             object.__setattr__(self, name, float(getattr(self, name)))
         if self.mask.shape == self.grid.shape:
             object.__setattr__(self, "mask", np.broadcast_to(self.mask, (len(self.time), *self.grid.shape)))
-        check_shapes(self)
+        _check_shapes(self)
 
     @property
     def dimension(self) -> int:
@@ -133,8 +138,16 @@ class Recording:
         return found
 
     def check(self, source: str = "recording") -> None:
-        """Raise RecordingError for the first rule of the format that is broken; `source` opens the text."""
-        check(self, source)
+        """Test every rule of the format.
+
+        Args:
+            source: what the text of a fault opens with, as a file's name.
+
+        Raises:
+            RecordingError: the first rule that is broken.
+        """
+        for rules in RULES:
+            rules(self, source)
 
     def select(self, frames: slice | Sequence[int] | np.ndarray) -> Recording:
         """Some of the frames, in increasing order of time: a slice, frame numbers or a bool for each frame.
@@ -142,7 +155,7 @@ class Recording:
         The period stays what it is: frames left out do not change the motion that they sample.
         """
         chosen = np.arange(self.frames)[frames if isinstance(frames, slice) else np.asarray(frames)]
-        changes: dict[str, object] = {"wall": self.wall.select(chosen)}
+        changes: dict[str, Any] = {"wall": self.wall.select(chosen)}
         for name, _, _ in LAYOUT:
             value = None if name.startswith("wall.") else getattr(self, name)
             still = name == "valve_intervals" or (
@@ -164,7 +177,7 @@ class Recording:
 
         What belonged to the old velocity (weight, sigma, beam, pressure, fluxes) is dropped.
         """
-        gone = dict.fromkeys(("weight", "beam", "pressure", "flux_mitral", "flux_aortic"))
+        gone: dict[str, Any] = dict.fromkeys(("weight", "beam", "pressure", "flux_mitral", "flux_aortic"))
         text = self.description if description is None else description
         return replace(self, velocity=velocity, sigma=sigma, uncovered=uncovered, description=text, **gone)
 
@@ -196,3 +209,41 @@ def _coerce(instance: Wall | Recording, prefix: str) -> None:
         value = getattr(instance, item.name)
         if item.name in kinds and value is not None:
             object.__setattr__(instance, item.name, np.asarray(value, dtype=kinds[item.name]))
+
+
+def _check_shapes(recording: Recording) -> None:
+    """Ranks and sizes that must agree: time, grid, wall and valves against each other."""
+    source, arrays = "recording", recording.arrays()
+    if recording.time.ndim != 1 or recording.time.size == 0:
+        raise RecordingError(source, "/time", f"must be (T,) with at least one frame, not {recording.time.shape}")
+    for dataset, shapes in _allowed_shapes(recording).items():
+        if dataset in arrays and arrays[dataset].shape not in shapes:
+            wanted = " or ".join(str(shape) for shape in shapes)
+            rule = f"has the shape {arrays[dataset].shape}, but others in the recording ask for {wanted}"
+            raise RecordingError(source, dataset, rule)
+
+
+def _allowed_shapes(recording: Recording) -> dict[str, tuple[tuple[int, ...], ...]]:
+    """The shapes that each dataset may have, given the frames, the grid and the size of the wall."""
+    frames, dimension, shape = recording.time.shape[0], recording.grid.dimension, recording.grid.shape
+    wall, intervals = recording.wall, recording.valve_intervals
+    points = (wall.vertices.shape[-2] if wall.vertices.ndim in (2, 3) else 0, dimension)
+    faces = wall.faces.shape[0] if wall.faces.ndim else 0
+    return {
+        "/velocity": ((frames, dimension, *shape),),
+        "/mask": ((frames, *shape),),
+        "/weight": ((frames, *shape),),
+        "/sigma": ((frames, dimension, *shape),),
+        "/uncovered": ((frames,),),
+        "/beam": ((frames, dimension, *shape), (dimension, *shape)),
+        "/pressure": ((frames, *shape),),
+        "/wall/vertices": ((frames, *points), points),
+        "/wall/faces": ((faces, dimension),),
+        "/wall/region": ((faces,),),
+        "/wall/velocity": ((frames, *points),),
+        "/valve/intervals": ((len(intervals) if intervals is not None and intervals.ndim else 0, 3),),
+        "/valve_open": ((frames, 2),),
+        "/volume": ((frames,),),
+        "/flux/mitral": ((frames,),),
+        "/flux/aortic": ((frames,),),
+    }

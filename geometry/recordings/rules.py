@@ -1,37 +1,31 @@
 """The rules of the recording file, each with a message that names the dataset, the rule broken and the cure.
 
-A rule is stated once, here, and holds for a recording that was read as well as for one about to be written.
+A rule is stated once, here, and holds for a recording that was read as well as for one about to be written. Ranks and
+sizes that must agree are invariants of the class (`Recording`), which refuses to be built otherwise.
 """
 
 from __future__ import annotations
-
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from geometry.surfaces.surface import SurfaceError
 
-if TYPE_CHECKING:
-    from .recording import Recording
+from .errors import RecordingError
+from .recording import RULES, Recording
 
 FASTEST = 20.0  # m/s; blood never is as fast, so larger numbers are mm/s or cm/s
 
 
-class RecordingError(ValueError):
-    """A recording, in a file or in memory, breaks a rule of the format."""
+def check_recording(recording: Recording, source: str = "recording") -> None:
+    """Hold a recording against every rule of the format.
 
-    def __init__(self, source: str, dataset: str, rule: str) -> None:
-        super().__init__(f"{source}: {dataset}: {rule}")
-        self.source, self.dataset, self.rule = source, dataset, rule
+    Args:
+        recording: in memory, its shapes agreeing as the class asks.
+        source: say the file; it opens the message.
 
-    def __reduce__(self) -> tuple[type, tuple[str, str, str]]:
-        """Errors cross processes by pickling, which would hand the whole message to `source`."""
-        return type(self), (self.source, self.dataset, self.rule)
-
-
-def check(recording: Recording, source: str = "recording") -> None:
-    """Raise RecordingError for the first rule that is broken; `source`, say the file, opens the message."""
-    check_shapes(recording, source)
+    Raises:
+        RecordingError: the first rule that is broken.
+    """
     for rule in (
         _constants,
         _time,
@@ -48,42 +42,7 @@ def check(recording: Recording, source: str = "recording") -> None:
         rule(recording, source)
 
 
-def check_shapes(recording: Recording, source: str = "recording") -> None:
-    """Ranks and sizes that must agree: time, grid, wall and valves against each other."""
-    arrays = recording.arrays()
-    if recording.time.ndim != 1 or recording.time.size == 0:
-        raise RecordingError(source, "/time", f"must be (T,) with at least one frame, not {recording.time.shape}")
-    for dataset, shapes in allowed_shapes(recording).items():
-        if dataset in arrays and arrays[dataset].shape not in shapes:
-            wanted = " or ".join(str(shape) for shape in shapes)
-            rule = f"has the shape {arrays[dataset].shape}, but others in the recording ask for {wanted}"
-            raise RecordingError(source, dataset, rule)
-
-
-def allowed_shapes(recording: Recording) -> dict[str, tuple[tuple[int, ...], ...]]:
-    """The shapes that each dataset may have, given the frames, the grid and the size of the wall."""
-    frames, dimension, shape = recording.time.shape[0], recording.grid.dimension, recording.grid.shape
-    wall, intervals = recording.wall, recording.valve_intervals
-    points = (wall.vertices.shape[-2] if wall.vertices.ndim in (2, 3) else 0, dimension)
-    faces = wall.faces.shape[0] if wall.faces.ndim else 0
-    return {
-        "/velocity": ((frames, dimension, *shape),),
-        "/mask": ((frames, *shape),),
-        "/weight": ((frames, *shape),),
-        "/sigma": ((frames, dimension, *shape),),
-        "/uncovered": ((frames,),),
-        "/beam": ((frames, dimension, *shape), (dimension, *shape)),
-        "/pressure": ((frames, *shape),),
-        "/wall/vertices": ((frames, *points), points),
-        "/wall/faces": ((faces, dimension),),
-        "/wall/region": ((faces,),),
-        "/wall/velocity": ((frames, *points),),
-        "/valve/intervals": ((len(intervals) if intervals is not None and intervals.ndim else 0, 3),),
-        "/valve_open": ((frames, 2),),
-        "/volume": ((frames,),),
-        "/flux/mitral": ((frames,),),
-        "/flux/aortic": ((frames,),),
-    }
+RULES.append(check_recording)
 
 
 def measured_nodes(recording: Recording) -> np.ndarray:

@@ -37,11 +37,12 @@ def tube(radius: float, length: float, spacing: float) -> Surface:
 
 def box(lower: Sequence[float], upper: Sequence[float], spacing: float) -> Surface:
     """A box between two corners (m), its sides cut at about `spacing`; one region, the wall."""
-    lower, upper = np.asarray(lower, np.float64), np.asarray(upper, np.float64)
-    size = _positive("box: upper - lower", upper - lower, 3)
+    first = np.asarray(lower, np.float64)
+    size = _positive("box: upper - lower", np.asarray(upper, np.float64) - first, 3)
     _positive("box: spacing", [spacing], 1)
     count = np.maximum(np.rint(size / spacing), 1).astype(np.int64)
-    points, faces = [], []
+    points: list[np.ndarray] = []
+    faces: list[np.ndarray] = []
     for axis in range(3):
         u, v = (axis + 1) % 3, (axis + 2) % 3
         i, j = (a.ravel() for a in np.meshgrid(np.arange(count[u]), np.arange(count[v]), indexing="ij"))
@@ -57,7 +58,7 @@ def box(lower: Sequence[float], upper: Sequence[float], spacing: float) -> Surfa
             faces.append(quads[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3))
     # The sides were made one by one; lattice coordinates tell exactly which of their vertices coincide.
     lattice, place = np.unique(np.concatenate(points), axis=0, return_inverse=True)
-    return Surface(lower + lattice / count * size, place.reshape(-1)[np.concatenate(faces)])
+    return Surface(first + lattice / count * size, place.reshape(-1)[np.concatenate(faces)])
 
 
 def ellipse(semi_axes: Sequence[float], spacing: float, centre: Sequence[float] = (0.0, 0.0)) -> Surface:
@@ -81,7 +82,7 @@ def polygon(corners: np.ndarray, spacing: float) -> Surface:
     return surface
 
 
-def ellipse_rim(semi_axes: Sequence[float], spacing: float) -> np.ndarray:
+def ellipse_rim(semi_axes: Sequence[float] | np.ndarray, spacing: float) -> np.ndarray:
     """Points evenly along an ellipse, about `spacing` apart, counter-clockwise: `(n, 2)`, m."""
     fine = np.linspace(0, 2 * np.pi, 2001)
     points = np.stack([semi_axes[0] * np.cos(fine), semi_axes[1] * np.sin(fine)], axis=1)
@@ -134,7 +135,7 @@ def stitched(first: int, count: int, second: int, other: int) -> np.ndarray:
     return np.array(faces)
 
 
-def _positive(name: str, values: Sequence[float], count: int) -> np.ndarray:
+def _positive(name: str, values: Sequence[float] | np.ndarray, count: int) -> np.ndarray:
     array = np.asarray(values, np.float64)
     if array.shape != (count,) or not (np.isfinite(array) & (array > 0)).all():
         raise SurfaceError(f"{name} must be {count} positive lengths (m), not {values}")

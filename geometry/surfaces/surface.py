@@ -6,7 +6,7 @@ plane).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -36,7 +36,7 @@ class Surface:
 
     vertices: np.ndarray
     faces: np.ndarray
-    region: np.ndarray = field(default=None)  # type: ignore[assignment]
+    region: np.ndarray = None  # type: ignore[assignment]  # an array once built
 
     def __post_init__(self) -> None:
         vertices = np.ascontiguousarray(self.vertices, dtype=np.float64)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import numpy as np
 from scipy.spatial import Delaunay, cKDTree
@@ -10,11 +10,51 @@ from scipy.spatial import Delaunay, cKDTree
 from geometry.surfaces.shapes import ellipse_rim, ring_of, stitched
 from geometry.surfaces.surface import Surface, SurfaceError
 
-if TYPE_CHECKING:
-    from .ventricle import Ventricle
+
+class VentricleShape(Protocol):
+    """What the mesh needs of a ventricle: a truncated spheroid with two orifices in its base plane, in m."""
+
+    @property
+    def length(self) -> float:
+        """From base to apex."""
+
+    @property
+    def semi_major(self) -> float:
+        """Of the spheroid, along z."""
+
+    @property
+    def semi_minor(self) -> float:
+        """Of the spheroid, across."""
+
+    @property
+    def offset(self) -> float:
+        """How far the spheroid's centre lies below the base."""
+
+    @property
+    def base_radius(self) -> float:
+        """Radius of the base."""
+
+    @property
+    def mitral_centre(self) -> tuple[float, float]:
+        """(x, y) in the base plane."""
+
+    @property
+    def mitral_semi_axes(self) -> tuple[float, float]:
+        """Along x and y."""
+
+    @property
+    def aortic_centre(self) -> tuple[float, float]:
+        """(x, y) in the base plane."""
+
+    @property
+    def aortic_radius(self) -> float:
+        """Of the circular outlet."""
+
+    def rims(self, count: int) -> tuple[np.ndarray, np.ndarray]:
+        """Points (count, 2) each on the mitral and the aortic rim."""
 
 
-def ventricle_surface(shape: Ventricle, spacing: float) -> Surface:
+def ventricle_surface(shape: VentricleShape, spacing: float) -> Surface:
     """The end-diastolic surface, vertices about `spacing` (m) apart; SurfaceError if that is too coarse."""
     if not 0 < spacing <= 0.5 * shape.base_radius:
         raise SurfaceError(f"ventricle: spacing must be positive and below half the base radius, not {spacing} m")
@@ -32,7 +72,7 @@ def ventricle_surface(shape: Ventricle, spacing: float) -> Surface:
     return Surface(vertices, _outward(vertices, faces, np.array([0, 0, -shape.length / 3])), region)
 
 
-def _side(shape: Ventricle, spacing: float) -> list[np.ndarray]:
+def _side(shape: VentricleShape, spacing: float) -> list[np.ndarray]:
     """Rings from the base to the apex, evenly along the meridian."""
     angle = np.linspace(np.arccos(shape.offset / shape.semi_major), np.pi, 2001)
     radius, z = shape.semi_minor * np.sin(angle), shape.semi_major * np.cos(angle) - shape.offset
@@ -45,7 +85,7 @@ def _side(shape: Ventricle, spacing: float) -> list[np.ndarray]:
     return [ring_of(shape.base_radius, 0.0, spacing), *rings, np.array([[0.0, 0.0, -shape.length]])]
 
 
-def _base(shape: Ventricle, top: np.ndarray, spacing: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _base(shape: VentricleShape, top: np.ndarray, spacing: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The base's own points `(n, 2)`, its faces (the top ring is numbered first) and their regions."""
     mitral, aortic = (np.asarray(c) for c in (shape.mitral_centre, shape.aortic_centre))
     circle = (shape.aortic_radius, shape.aortic_radius)

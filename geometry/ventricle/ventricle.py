@@ -1,4 +1,4 @@
-"""The thesis's ventricle (section 3.4): a truncated prolate spheroid, elliptical inlet, circular outlet.
+"""The ventricle of Grønli 2017, sec. 3.4: a truncated prolate spheroid, elliptical inlet, circular outlet.
 
 The base is the plane z = 0 and stays there, the apex lies on the negative z axis, and the wall moves
 affinely: (x, y) grow with `radial(t)`, z with `axial(t)`. With v = V(t) / V(end diastole), axial = v^k and
@@ -186,9 +186,10 @@ class Ventricle:
         nodes = grid.nodes().numpy()
         mask = np.stack([self.contains(nodes, t).reshape(grid.shape) for t in time])
         field = np.zeros((len(time), 3, *grid.shape), np.float32)
-        for frame, t in enumerate(time if velocity is not None else ()):
-            values = np.where(mask[frame].reshape(-1, 1), velocity(nodes, t), 0)
-            field[frame] = values.T.reshape(3, *grid.shape)
+        if velocity is not None:
+            for frame, t in enumerate(time):
+                values = np.where(mask[frame].reshape(-1, 1), velocity(nodes, t), 0)
+                field[frame] = values.T.reshape(3, *grid.shape)
         return Recording(
             time=time,
             grid=grid,
@@ -201,9 +202,9 @@ class Ventricle:
             description="parametric ventricle: truncated prolate spheroid, affine motion, fixed base z = 0",
             valve_intervals=np.array([(1, *self.beat.filling), (2, *self.beat.ejection)]),
             valve_open=np.stack([self._open(time, self.beat.filling), self._open(time, self.beat.ejection)], axis=1),
-            volume=[self.volume(t) for t in time],
-            flux_mitral=[max(self.volume_rate(t), 0.0) for t in time],
-            flux_aortic=[min(self.volume_rate(t), 0.0) for t in time],
+            volume=np.array([self.volume(t) for t in time]),
+            flux_mitral=np.array([max(self.volume_rate(t), 0.0) for t in time]),
+            flux_aortic=np.array([min(self.volume_rate(t), 0.0) for t in time]),
         )
 
     def _open(self, time: np.ndarray, interval: tuple[float, float]) -> np.ndarray:

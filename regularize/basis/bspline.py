@@ -2,8 +2,8 @@
 
 The pieces are polynomials of the local coordinate t in [0, 1); on each interval degree + 1 basis functions
 are non-zero. Their coefficients follow from the Cox-de Boor recursion (C. de Boor, A Practical Guide to
-Splines, 1978; thesis eq. 2.38), carried out once in exact rational arithmetic. For degree 3 they are the
-cubic cardinal B-spline of thesis eq. 2.39.
+Splines, 1978; Grønli 2017, eq. 2.37), carried out once in exact rational arithmetic. For degree 3 they are the
+cubic cardinal B-spline of Grønli 2017, eq. 2.39.
 """
 
 from fractions import Fraction

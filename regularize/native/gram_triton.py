@@ -11,7 +11,7 @@ import os
 import torch
 
 from regularize.rows.assembly import add_cell_rows, empty_band
-from regularize.rows.operators import CellRows, RowBlock, System, VectorRows
+from regularize.rows.operators import CellRows, PointRows, System, VectorRows, at_points
 from regularize.rows.ordering import Ordering
 
 TILE = 32  # columns of a program: 1024 sums, eight for each of 128 threads
@@ -31,12 +31,12 @@ def triton_band(system: System, ordering: Ordering) -> torch.Tensor:
     for block in system.blocks:
         if isinstance(block, CellRows):
             add_cell_rows(band, block, system.components, ordering)
-        elif len(block) > 0:
-            _add_block(band, block, system.components, ordering)
+        elif len(block.cell) > 0:
+            _add_block(band, at_points(block), system.components, ordering)
     return band
 
 
-def _add_block(band: torch.Tensor, block: RowBlock, components: int, ordering: Ordering) -> None:
+def _add_block(band: torch.Tensor, block: PointRows, components: int, ordering: Ordering) -> None:
     slot = ordering.slots(block.cell)
     index = torch.argsort(slot, stable=True)
     edges = torch.arange(len(ordering.keys) + 1, device=slot.device)

@@ -4,12 +4,13 @@ Every row lives in one knot cell and touches only that cell's coefficients, so a
 dense block instead of one sparse product per row.
 """
 
+from functools import reduce
 from math import prod
 from mmap import mmap
 
 import torch
 
-from .operators import CellRows, RowBlock, System, VectorRows
+from .operators import CellRows, RowBlock, System, VectorRows, at_points
 from .ordering import Ordering
 
 LAZY = 1 << 24  # bytes from which on a band is mapped page by page
@@ -40,7 +41,7 @@ def reference_band(system: System, ordering: Ordering) -> torch.Tensor:
     groups = [_CellGroups(block, system.components, ordering) for block in system.blocks]
     for start in range(0, len(ordering.keys), CELLS_PER_PASS):
         part = slice(start, min(start + CELLS_PER_PASS, len(ordering.keys)))
-        total = sum(group.gram(part) for group in groups)
+        total = reduce(torch.add, [group.gram(part) for group in groups])
         _scatter(band, total, system.components, ordering, part)
     return band
 
@@ -98,8 +99,8 @@ class _CellGroups:
         return total.flatten(1, 2).flatten(2, 3)
 
     def _add_points(self, total: torch.Tensor, rows: torch.Tensor, valid: torch.Tensor) -> None:
-        values = self.block.rows_at(rows).double()
-        weight = self.block.weight[rows].double()
+        block = at_points(self.block)
+        values, weight = block.rows_at(rows).double(), block.weight[rows].double()
         if not isinstance(self.block, VectorRows):
             values = (values * (valid * weight)[:, None, None]).view(len(total), -1, self.size * self.components)
             total += torch.bmm(values.mT, values).view_as(total)

@@ -1,11 +1,12 @@
 """Linear rows of the spline system, matrix-free, each with its exact adjoint.
 
 A coefficient vector is a tensor (nodes, C) for C velocity components. Every row block maps it to its rows
-and back; blocks are stacked by :class:`System` into the matrix of thesis eq. 3.22. Rows, not squared terms,
-are scaled: a row of weight w contributes w^2 to the cost (ERRATA 3.10/3.16).
+and back; blocks are stacked by :class:`System` into the matrix of Grønli 2017, eq. 3.22. Rows, not squared terms,
+are scaled: a row of weight w contributes w^2 to the cost (our reading of Grønli 2017, eq. 3.10 and eq. 3.16).
 """
 
 from collections.abc import Iterator, Sequence
+from functools import reduce
 from typing import Protocol
 
 import torch
@@ -17,17 +18,38 @@ CHUNK = 4096  # points per pass: bounds the (points, local_size, C) buffers to a
 
 
 class RowBlock(Protocol):
-    """What the solvers ask of a set of rows."""
+    """What the solvers ask of a set of rows, each of which lives in one knot cell.
 
-    target: torch.Tensor  # (rows,) right-hand side, already weighted
+    Args:
+        knots: the grid of the coefficients.
+        components: C of the field.
+        cell: (groups, A), the cells of the rows, one or more rows each.
+        target: (rows,), right-hand side, already weighted.
+    """
 
-    def matvec(self, c: torch.Tensor) -> torch.Tensor: ...  # (nodes, C) -> (rows,)
+    knots: Knots
+    components: int
+    cell: torch.Tensor
+    target: torch.Tensor
 
-    def rmatvec(self, r: torch.Tensor) -> torch.Tensor: ...  # (rows,) -> (nodes, C)
+    def matvec(self, c: torch.Tensor) -> torch.Tensor:
+        """(nodes, C) -> (rows,)."""
+
+    def rmatvec(self, r: torch.Tensor) -> torch.Tensor:
+        """(rows,) -> (nodes, C), the exact adjoint of :meth:`matvec`."""
 
 
-class _PointRows:
-    """Shared bookkeeping of rows that live at points (n, A) inside the knot box."""
+class PointRows:
+    """Shared bookkeeping of rows that live at points inside the knot box.
+
+    Args:
+        knots: the grid.
+        points: (n, A), m (and s).
+        components: C of the field.
+    """
+
+    weight: torch.Tensor  # (n, C) or (n,), row factors
+    target: torch.Tensor  # (rows,), already weighted
 
     def __init__(self, knots: Knots, points: torch.Tensor, components: int) -> None:
         if points.ndim != 2 or points.shape[1] != knots.axes:
@@ -47,8 +69,15 @@ class _PointRows:
         raise NotImplementedError
 
 
-class VectorRows(_PointRows):
-    """Rows w_ik v_k(x_i) = w_ik target_ik, one per point and component (the matrix S of thesis eq. 3.7)."""
+def at_points(block: "RowBlock") -> PointRows:
+    """The same block, which must be one of rows at points; TypeError where an engine meets rows it does not know."""
+    if not isinstance(block, PointRows):
+        raise TypeError(f"{type(block).__name__} are neither CellRows nor PointRows: no engine knows how to add them")
+    return block
+
+
+class VectorRows(PointRows):
+    """Rows w_ik v_k(x_i) = w_ik target_ik, one per point and component (the matrix S of Grønli 2017, eq. 3.7)."""
 
     def __init__(self, knots: Knots, points: torch.Tensor, target: torch.Tensor, weight: torch.Tensor) -> None:
         super().__init__(knots, points, target.shape[1])
@@ -118,7 +147,7 @@ class VectorRows(_PointRows):
         return one
 
 
-class _CoupledRows(_PointRows):
+class _CoupledRows(PointRows):
     """One row per point, touching all components of the local coefficients."""
 
     def __init__(
@@ -145,7 +174,7 @@ class _CoupledRows(_PointRows):
 
 
 class DirectionRows(_CoupledRows):
-    """Rows w_i d_i . v(x_i): wall normals (thesis eq. 3.21), Doppler beams. direction (n, C), target (n,)."""
+    """Rows w_i d_i . v(x_i): wall normals (Grønli 2017, eq. 3.21), Doppler beams. direction (n, C), target (n,)."""
 
     def __init__(
         self,
@@ -163,7 +192,7 @@ class DirectionRows(_CoupledRows):
 
 
 class DivergenceRows(_CoupledRows):
-    """Rows w_i div v(x_i) = 0, derivatives per metre (thesis eq. 3.13)."""
+    """Rows w_i div v(x_i) = 0, derivatives per metre (Grønli 2017, eq. 3.13)."""
 
     def __init__(self, knots: Knots, points: torch.Tensor, components: int, weight: torch.Tensor) -> None:
         super().__init__(knots, points, components, torch.zeros_like(points[:, 0]), weight)
@@ -210,7 +239,7 @@ class CellRows:
 
 
 class System:
-    """Stacked row blocks with damping: minimise |A c - b|^2 + damping^2 |c|^2 (thesis eq. 3.22)."""
+    """Stacked row blocks with damping: minimise |A c - b|^2 + damping^2 |c|^2 (Grønli 2017, eq. 3.22)."""
 
     def __init__(self, knots: Knots, components: int, blocks: Sequence[RowBlock], damping: float) -> None:
         if not blocks:
@@ -234,7 +263,8 @@ class System:
     def rmatvec(self, r: torch.Tensor) -> torch.Tensor:
         """(rows,) -> (unknowns,), the exact adjoint of :meth:`matvec`."""
         parts = r.split(self._sizes)
-        return sum(block.rmatvec(part) for block, part in zip(self.blocks, parts, strict=True)).flatten()
+        pulled = [block.rmatvec(part) for block, part in zip(self.blocks, parts, strict=True)]
+        return reduce(torch.add, pulled).flatten()
 
     def right_side(self) -> torch.Tensor:
         """A' b, float64."""

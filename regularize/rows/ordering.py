@@ -71,7 +71,8 @@ def order(system: System) -> Ordering:
     # the sort is stable, so that a cube keeps the array order: last axis slowest, x fastest
     axes = tuple(sorted(reversed(range(knots.axes)), key=lambda k: -knots.cells[k]))
     cell = torch.cat([block.cell for block in system.blocks])
-    blank = Ordering(knots, axes, *[torch.empty(0)] * 4, 0)
+    empty = torch.empty(0)
+    blank = Ordering(knots, axes, empty, empty, empty, empty, 0)
     held = torch.zeros(prod(knots.cells), dtype=torch.bool, device=cell.device)
     held[blank.key(cell)] = True  # a table instead of sorting the rows
     keys, places = held.nonzero().flatten(), held.cumsum(0) - 1

@@ -18,7 +18,7 @@ from regularize.errors import InvalidInput
 
 def product_gram(knots: Knots, first: Sequence[int], second: Sequence[int]) -> np.ndarray:
     """(L, L): integral over a cell of d^first B_i times d^second B_j; orders per axis, x first."""
-    gram = np.ones((1, 1))
+    gram: np.ndarray = np.ones((1, 1))
     for axis in reversed(range(knots.axes)):
         h = knots.spacing[axis]
         one = interval_gram(knots.degree, first[axis], second[axis]) * h ** (1 - first[axis] - second[axis])

@@ -1,4 +1,4 @@
-"""The system as a sparse matrix with its transpose stored beside it (thesis section 3.2.5).
+"""The system as a sparse matrix with its transpose stored beside it (Grønli 2017, sec. 3.2.5).
 
 Twice the memory of one copy, but A' u then runs as fast as A v. The matrix-free operators need neither.
 """
@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 import torch
 
-from .operators import CellRows, RowBlock, System, VectorRows
+from .operators import CellRows, RowBlock, System, VectorRows, at_points
 
 Apply = Callable[[torch.Tensor], torch.Tensor]
 
@@ -37,7 +37,8 @@ def sparse_operators(system: System) -> tuple[Apply, Apply]:
 
     def pair(dtype: torch.dtype) -> tuple[torch.Tensor, torch.Tensor]:
         if dtype not in stored:
-            stored[dtype] = tuple(matrix.to(dtype) for matrix in stored[torch.float64])
+            matrix, transpose = stored[torch.float64]
+            stored[dtype] = matrix.to(dtype), transpose.to(dtype)
         return stored[dtype]
 
     return (lambda x: pair(x.dtype)[0] @ x), (lambda r: pair(r.dtype)[1] @ r)
@@ -52,9 +53,9 @@ def _entries(block: RowBlock, c: int) -> tuple[torch.Tensor, torch.Tensor]:
     nodes = block.knots.local_nodes(block.cell)
     if isinstance(block, CellRows):
         return _cell_entries(block, nodes, c)
-    values = block.rows_at(slice(None)).double()
-    weight = block.weight.double()
-    if isinstance(block, VectorRows):
+    rows = at_points(block)
+    values, weight = rows.rows_at(slice(None)).double(), rows.weight.double()
+    if isinstance(rows, VectorRows):
         column = nodes[:, None, :] * c + torch.arange(c)[:, None]
         value = values[:, None, :] * weight[:, :, None]
         return column.flatten(0, 1), value.flatten(0, 1)

@@ -11,18 +11,23 @@ from regularize.errors import InvalidInput
 class WallRows:
     """Points on walls and orifices with the velocity the blood has there.
 
-    ``points`` (n, D) in m. ``normals`` (n, D), of any orientation: the row is n . v = n . velocity (thesis
-    eq. 3.21). ``velocity`` (n, D) in m/s: the moving wall's own, or the plug velocity of an open valve.
-    ``weight`` (n,) multiplies each row's square (the area it stands for; 1 where absent). ``no_slip`` (n,)
-    bool: rows whose full velocity vector, not only its normal part, equals ``velocity`` (False at open
-    valves); absent = all of them.
+    Args:
+        points: (n, D), m; (n, D + 1) with the time in s last.
+        normals: (n, D), of any orientation and length: the row is n . v = n . velocity (Grønli 2017, eq. 3.21).
+        velocity: (n, D), m/s: the moving wall's own, or the plug velocity of an open valve.
+        weight: (n,), multiplies each row's square: the area it stands for; None: 1.
+        no_slip: (n,) bool, rows whose full velocity vector, not only its normal part, equals ``velocity`` (False at
+            open valves); None: all of them.
+
+    Raises:
+        InvalidInput: shapes that disagree, values that are not finite, a negative weight, a normal of length 0.
     """
 
     points: torch.Tensor
     normals: torch.Tensor
     velocity: torch.Tensor
-    weight: torch.Tensor | None = None
-    no_slip: torch.Tensor | None = None
+    weight: torch.Tensor = None  # type: ignore[assignment]  # a tensor once built
+    no_slip: torch.Tensor = None  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
         points = torch.as_tensor(self.points)
@@ -63,10 +68,7 @@ class WallRows:
         )
 
     def to(self, dtype: torch.dtype, device: torch.device | str) -> "WallRows":
-        return WallRows(
-            *(
-                value.to(device=device, dtype=dtype)
-                for value in (self.points, self.normals, self.velocity, self.weight)
-            ),
-            self.no_slip.to(device),
-        )
+        """The same rows in another type, on another device."""
+        fields = (self.points, self.normals, self.velocity, self.weight)
+        points, normals, velocity, weight = (value.to(device=device, dtype=dtype) for value in fields)
+        return WallRows(points, normals, velocity, weight, self.no_slip.to(device))

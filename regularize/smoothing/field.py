@@ -1,13 +1,13 @@
 """A fitted vector field: callable, with exact derivatives, and masked where nothing supports it."""
 
 from collections.abc import Sequence
+from functools import reduce
 
 import torch
 
 from regularize.basis.knots import Knots
 from regularize.errors import InvalidInput
-from regularize.solvers.direct import Factor
-from regularize.solvers.krylov import Solution
+from regularize.solvers.interface import CholeskyFactor, Solution
 from regularize.statistics.likelihood import Choice
 from regularize.statistics.posterior import Posterior
 
@@ -15,7 +15,7 @@ FWHM = 2.3548  # of a Gaussian, in standard deviations
 
 
 class SplineField:
-    """v(x) = sum_j c_j B_j(x) (thesis eq. 3.5).
+    """v(x) = sum_j c_j B_j(x) (Grønli 2017, eq. 3.5).
 
     ``coefficients`` (C, *knots.shape) m/s; ``covered`` (cells,) bool says which knot cells held rows
     (samples, walls or penalties): elsewhere the field is not defined and evaluates to NaN, or to ``outside``.
@@ -30,7 +30,7 @@ class SplineField:
         left_out: int = 0,
         choice: Choice | None = None,
         posterior: Posterior | None = None,
-        factor: Factor | None = None,
+        factor: CholeskyFactor | None = None,
     ) -> None:
         self.knots, self.coefficients, self.covered = knots, coefficients, covered
         self.solution, self.left_out, self.choice = solution, left_out, choice
@@ -58,12 +58,12 @@ class SplineField:
     def divergence(self, points: torch.Tensor, outside: float = float("nan")) -> torch.Tensor:
         """(n,) in 1/s, from the analytic derivatives."""
         gradient = self.gradient(points, outside)
-        return sum(gradient[:, k, k] for k in range(self.components))
+        return reduce(torch.add, [gradient[:, k, k] for k in range(self.components)])
 
     def laplacian(self, points: torch.Tensor, outside: float = float("nan")) -> torch.Tensor:
         """(n, C): sum of the second derivatives along the axes of space, in 1/(m s)."""
         orders = [[2 * int(a == j) for a in range(self.knots.axes)] for j in range(self.components)]
-        return sum(self._evaluate(points, orders, outside))
+        return reduce(torch.add, self._evaluate(points, orders, outside))
 
     def std(self, points: torch.Tensor, outside: float = float("nan"), *, blur: float = 0.0) -> torch.Tensor:
         """Posterior standard deviation (n, C) in m/s at points (n, A); fit with ``uncertainty=True``.

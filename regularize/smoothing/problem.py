@@ -5,10 +5,11 @@ from math import prod
 
 import torch
 
-from regularize.rows.operators import System, VectorRows
-from regularize.solvers.block import BlockFactor
-from regularize.solvers.direct import Factor, PreparedSystem, solve_direct
-from regularize.solvers.krylov import Solution
+from regularize.rows.operators import DirectionRows, System, VectorRows
+from regularize.solvers.direct import solve_direct
+from regularize.solvers.factor import Factor
+from regularize.solvers.interface import CholeskyFactor, Solution
+from regularize.solvers.prepared import PreparedSystem
 from regularize.statistics.correlated import CorrelatedErrors
 from regularize.statistics.likelihood import Choice
 from regularize.statistics.posterior import Posterior
@@ -25,9 +26,15 @@ class Problem:
     system: System
     choice: Choice | None
 
-    def field(
-        self, solution: Solution, factor: Factor | BlockFactor | None = None, own_factor: bool = True
-    ) -> SplineField:
+    @property
+    def samples(self) -> VectorRows | DirectionRows:
+        """The rows of the samples."""
+        block = self.system.blocks[0]
+        if not isinstance(block, VectorRows | DirectionRows):
+            raise TypeError(f"the first rows of a problem must be those of the samples, not {type(block).__name__}")
+        return block
+
+    def field(self, solution: Solution, factor: CholeskyFactor | None = None, own_factor: bool = True) -> SplineField:
         """The field of a solution; the factor of ``system`` itself also gives its uncertainty."""
         knots, data = self.system.knots, self.data
         coefficients = solution.x.to(data.dtype).view(knots.nodes, -1).T.reshape(-1, *knots.shape)
@@ -38,16 +45,16 @@ class Problem:
             posterior = self.posterior(solution, factor)
         return SplineField(knots, coefficients, covered, solution, data.left_out, self.choice, posterior, factor)
 
-    def posterior(self, solution: Solution, factor: Factor | BlockFactor) -> Posterior:
+    def posterior(self, solution: Solution, factor: CholeskyFactor) -> Posterior:
         """The posterior, with what the samples' errors are found to have in common."""
         return Posterior(factor, self.precision(solution), self.system.components, self.shared(solution, factor))
 
-    def shared(self, solution: Solution, factor: Factor | BlockFactor) -> torch.Tensor | None:
+    def shared(self, solution: Solution, factor: CholeskyFactor) -> torch.Tensor | None:
         """(C,) factors on the posterior's deviations for errors that samples share; None where they are not looked for:
 
         along beams, over time and on a GPU.
         """
-        data, system, fit = self.data, self.system, self.system.blocks[0]
+        data, system, fit = self.data, self.system, self.samples
         if not isinstance(fit, VectorRows) or data.over_time or not isinstance(factor, Factor):
             return None
         fitted = fit.with_unit_weight().matvec(solution.x.view(system.knots.nodes, -1)).view_as(data.velocity)
@@ -59,7 +66,7 @@ class Problem:
 
         Without an automatic choice the variance is the fit's own mean squared residual.
         """
-        fit = self.system.blocks[0]
+        fit = self.samples
         scale = self.data.weight.double().square().sum()
         scale = scale / (fit.weight.double().square().sum() / self.system.components)
         if self.choice is not None:
@@ -73,7 +80,10 @@ class Problem:
         prepared = PreparedSystem(self.system)
         factor, fields, members = prepared.factor(), [], []
         for velocity in velocities:
-            fit = self.system.blocks[0].with_target(velocity)
+            samples = self.samples
+            if not isinstance(samples, VectorRows):
+                raise TypeError("several sample sets at once need full vectors")
+            fit = samples.with_target(velocity)
             knots, components, damping = self.system.knots, self.system.components, self.system.damping
             system = System(knots, components, [fit, *self.system.blocks[1:]], damping)
             members.append(prepared.with_targets(system))

@@ -1,24 +1,21 @@
 """From checked samples and options to the row blocks of the system."""
 
 from math import prod
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
 from regularize.basis.knots import Knots
 from regularize.errors import InvalidInput
+from regularize.options import SplineOptions
 from regularize.rows.operators import CellRows, DirectionRows, DivergenceRows, RowBlock, System, VectorRows
 from regularize.rows.penalties import curvature_gram, divergence_gram, row_factor
 from regularize.rows.walls import WallRows
 
 from .samples import FitData
 
-if TYPE_CHECKING:
-    from .smoother import Smoother
 
-
-def knots_for(data: FitData, options: "Smoother") -> Knots:
+def knots_for(data: FitData, options: SplineOptions) -> Knots:
     """The knot grid around the data: of a given spacing, or of given counts with the longest side first."""
     sides = [b - a for a, b in zip(data.lower, data.upper, strict=True)]
     if options.nodes is not None:
@@ -26,7 +23,7 @@ def knots_for(data: FitData, options: "Smoother") -> Knots:
             raise InvalidInput("nodes fixes a grid in space alone: over time give knots and time_knots")
         return _knots_of_counts(data, options.nodes, sides, options.degree)
     spacing, space = options.knots, data.components
-    each = [spacing] * space if isinstance(spacing, int | float) else list(spacing)
+    each = [float(spacing)] * space if isinstance(spacing, int | float) else list(spacing or ())
     if data.over_time:
         if options.time_knots is None:
             raise InvalidInput("points hold a time column: give time_knots, the knot distance in s")
@@ -50,14 +47,14 @@ def _knots_of_counts(data: FitData, nodes: tuple[int, ...], sides: list[float], 
     return Knots(tuple(origin), tuple(step), tuple(cells), degree)
 
 
-def build_system(options: "Smoother", knots: Knots, data: FitData) -> System:
-    """The rows of thesis eq. 3.22 (plus no-slip and curvature) with the options' scaling."""
+def build_system(options: SplineOptions, knots: Knots, data: FitData) -> System:
+    """The rows of Grønli 2017, eq. 3.22 (plus no-slip and curvature) with the options' scaling."""
     return _thesis_system(options, knots, data) if options.scaling == "thesis" else _density(options, knots, data)
 
 
-def _thesis_system(options: "Smoother", knots: Knots, data: FitData) -> System:
+def _thesis_system(options: SplineOptions, knots: Knots, data: FitData) -> System:
     components = data.components
-    blocks = [sample_rows(knots, data, data.weight[:, None])]
+    blocks: list[RowBlock] = [sample_rows(knots, data, data.weight[:, None])]
     if options.divergence:
         where = data.points if data.divergence_points is None else data.divergence_points
         per_spacing = options.divergence * sum(knots.spacing[:components]) / components
@@ -70,7 +67,7 @@ def _thesis_system(options: "Smoother", knots: Knots, data: FitData) -> System:
     return System(knots, components, blocks, options.damping or 0.0)
 
 
-def _density(options: "Smoother", knots: Knots, data: FitData) -> System:
+def _density(options: SplineOptions, knots: Knots, data: FitData) -> System:
     weight = data.weight[:, None] * data.component_weight
     share = data.weight.double().square().sum().sqrt().to(weight)
     fit = sample_rows(knots, data, weight / share)
@@ -87,7 +84,7 @@ def sample_rows(knots: Knots, data: FitData, weight: torch.Tensor) -> VectorRows
 
 
 def penalty_blocks(
-    options: "Smoother", knots: Knots, data: FitData, fit: list[RowBlock]
+    options: SplineOptions, knots: Knots, data: FitData, fit: list[RowBlock]
 ) -> tuple[list[RowBlock], torch.Tensor, float]:
     """Rows of all penalties in the density scaling, the cells they cover, and the damping's row factor."""
     components, extent = data.components, data.extent(knots)
@@ -110,11 +107,11 @@ def penalty_blocks(
     return blocks, cells, (options.damping or 0.0) * (prod(knots.spacing) / extent) ** 0.5
 
 
-def smoothness_gram(options: "Smoother", knots: Knots, data: FitData) -> np.ndarray:
+def smoothness_gram(options: SplineOptions, knots: Knots, data: FitData) -> np.ndarray:
     """(L, L) cell integral of |grad^m v|^2, plus (time_curvature / curvature)^2m |d^m v / dt^m|^2, m the order."""
     gram = curvature_gram(knots, range(data.components), options.order)
     if data.over_time and options.time_curvature:
-        ratio = options.time_curvature / options.curvature
+        ratio = options.time_curvature / (options.curvature or 1.0)
         gram = gram + ratio ** (2 * options.order) * curvature_gram(knots, [data.components], options.order)
     return gram
 
@@ -124,9 +121,11 @@ def wall_roots(wall: WallRows) -> torch.Tensor:
     return (wall.weight / wall.weight.sum()).sqrt()
 
 
-def _wall_blocks(knots: Knots, wall: WallRows, normal: float | None, no_slip: float | None, root: torch.Tensor) -> list:
+def _wall_blocks(
+    knots: Knots, wall: WallRows, normal: float | None, no_slip: float | None, root: torch.Tensor
+) -> list[RowBlock]:
     """Normal rows at every wall point, full-vector rows where the wall holds the blood."""
-    blocks = []
+    blocks: list[RowBlock] = []
     if normal:
         target = (wall.normals * wall.velocity).sum(1)
         blocks.append(DirectionRows(knots, wall.points, wall.normals, target, normal * root))

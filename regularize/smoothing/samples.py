@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import prod
-from typing import TYPE_CHECKING
+from typing import Any
 
 import torch
 from scipy.spatial import ConvexHull, QhullError
@@ -11,9 +11,7 @@ from scipy.spatial import ConvexHull, QhullError
 from regularize.basis.knots import Knots
 from regularize.errors import InvalidInput
 from regularize.rows.walls import WallRows
-
-if TYPE_CHECKING:
-    from regularize.statistics.likelihood import Choice
+from regularize.statistics.likelihood import Choice
 
 
 @dataclass(frozen=True)
@@ -86,7 +84,7 @@ class FitData:
         """Whether the last column of the points is the time."""
         return self.points.shape[1] > self.components
 
-    def reweighed(self, choice: "Choice") -> "FitData":
+    def reweighed(self, choice: Choice) -> "FitData":
         """With the robust factors and component noise that an automatic choice found."""
         precision = choice.deviation**-2
         each = (precision / precision.mean()).sqrt().to(self.points)
@@ -96,7 +94,7 @@ class FitData:
 
     def cpu(self) -> "FitData":
         """The same data on the CPU."""
-        move = {name: value.cpu() for name, value in vars(self).items() if isinstance(value, torch.Tensor)}
+        move: dict[str, Any] = {name: v.cpu() for name, v in vars(self).items() if isinstance(v, torch.Tensor)}
         wall = None if self.wall is None else self.wall.to(torch.float64, "cpu")
         return replace(self, wall=wall, **move)
 
@@ -111,9 +109,8 @@ class FitData:
     def volume(self) -> float:
         """Volume (area in 2-D) that samples and walls span, in m^D; 0 where they lie in one plane."""
         cloud = self.points if self.wall is None else torch.cat([self.points, self.wall.points])
-        cloud = cloud[:, : self.components].double().cpu().numpy()
         try:
-            return float(ConvexHull(cloud).volume)
+            return float(ConvexHull(cloud[:, : self.components].double().cpu().numpy()).volume)
         except (QhullError, ValueError):  # fewer than D + 1 points, or all in one plane
             return 0.0
 

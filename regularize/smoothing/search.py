@@ -1,11 +1,11 @@
 """The automatic choice for one set of samples: row groups on a coarser grid, and the search on them."""
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import torch
 
 from regularize.basis.knots import Knots
+from regularize.options import SplineOptions
 from regularize.rows.operators import CellRows, DivergenceRows, VectorRows
 from regularize.rows.penalties import row_factor
 from regularize.solvers.direct import solve_direct
@@ -16,13 +16,10 @@ from .problem import Problem
 from .row_blocks import build_system, penalty_blocks, smoothness_gram, wall_roots
 from .samples import FitData
 
-if TYPE_CHECKING:
-    from .smoother import Smoother
-
 FEWEST = 30  # below this the estimates scatter by more than the choice could gain
 
 
-def choose(options: "Smoother", knots: Knots, data: FitData) -> Choice | None:
+def choose(options: SplineOptions, knots: Knots, data: FitData) -> Choice | None:
     """Choose noise levels, curvature, no_slip and robust factors for ``data`` (see ``likelihood``).
 
     None where there is nothing to choose from: fewer than FEWEST samples, or no flow at all.
@@ -60,13 +57,14 @@ def choose(options: "Smoother", knots: Knots, data: FitData) -> Choice | None:
     with torch.no_grad():
         if options.automatic == "gcv":
             return cross_validate(search, options.no_slip, options.rounds)
-        choice = search.run(guess, options.curvature, options.no_slip, options.divergence, options.rounds)
+        choice = search.run(guess, options.curvature or 0.0, options.no_slip, options.divergence, options.rounds)
         return _counting_shared_errors(options, coarse, data, choice) if options.correlated else choice
 
 
-def _counting_shared_errors(options: "Smoother", coarse: Knots, data: FitData, choice: Choice) -> Choice:
+def _counting_shared_errors(options: SplineOptions, coarse: Knots, data: FitData, choice: Choice) -> Choice:
     """The choice with what neighbouring samples' errors are found to have in common in a fit on the search's grid."""
     data = data.reweighed(choice)
     problem = Problem(data, build_system(options.with_choice(choice), coarse, data), choice)
-    shared = problem.shared(*solve_direct(problem.system, strict=False))
+    solution, factor = solve_direct(problem.system, strict=False)
+    shared = None if factor is None else problem.shared(solution, factor)
     return choice if shared is None else choice.counting(shared)

@@ -14,7 +14,7 @@ from .smoother import Smoother
 def blur_in_time(fields: Sequence[SplineField], times: Sequence[float], width: float) -> list[SplineField]:
     """Gaussian blur, of standard deviation ``width`` in s, of the coefficients of frames at ``times`` in s.
 
-    The thesis's temporal blur (section 3.2.5). The fields share one knot grid. A coefficient that a frame
+    The temporal blur of Grønli 2017, sec. 3.2.5. The fields share one knot grid. A coefficient that a frame
     does not determine (no row touches it there) takes no part; width 0 changes nothing.
     """
     if len(fields) != len(times) or not fields:
@@ -51,7 +51,8 @@ class WindowedField:
     def __call__(self, points: torch.Tensor, outside: float = float("nan")) -> torch.Tensor:
         """Velocity (n, D) in m/s at points (n, D + 1) with the time in s last."""
         points = torch.as_tensor(points)
-        total, share = 0.0, torch.zeros(len(points), 1, dtype=points.dtype)
+        share = torch.zeros(len(points), 1, dtype=points.dtype)
+        total = torch.zeros(())
         for number, field in enumerate(self.fields):
             weight = self._weight(points[:, -1], number)[:, None]
             weight = torch.where(field.supported(points)[:, None], weight, 0.0)
@@ -96,7 +97,8 @@ def fit_windows(
         if more is not None:
             lower = torch.minimum(lower, more[:, :-1].amin(0))
             upper = torch.maximum(upper, more[:, :-1].amax(0))
-    windows, fields, start = [], [], first
+    windows: list[tuple[float, float]] = []
+    fields, start = [], first
     while not windows or windows[-1][1] < last:
         end = min(start + length, last)
         box = ([*lower.tolist(), start], [*upper.tolist(), max(end, start + 1e-9)])

@@ -5,12 +5,15 @@ M z = g with the same factor; then, for a row of weight w and unweighted values 
 b = w t, dL/db = w (s.z) and dL/dw = b (s.z) - 2 w (s.x)(s.z) at fixed b. No iteration is unrolled.
 """
 
+from dataclasses import replace
+
 import torch
 
 from regularize.rows.operators import System, VectorRows
 
-from .direct import Factor, PreparedSystem, solve_direct
-from .krylov import Solution
+from .direct import solve_direct
+from .interface import Solved
+from .prepared import PreparedSystem
 
 
 class _ImplicitSolve(torch.autograd.Function):
@@ -33,14 +36,16 @@ class _ImplicitSolve(torch.autograd.Function):
         return by_weight.view(weight.shape).to(weight), by_target.to(target), None, None, None, None
 
 
-def solve_with_gradient(system: System, tolerance: float, strict: bool = True) -> tuple[Solution, Factor]:
+def solve_with_gradient(system: System, tolerance: float, strict: bool = True) -> Solved:
     """As :func:`regularize.solve_direct`, keeping the graph to the first block's weights and targets.
 
     The first block must be VectorRows (full-vector samples); the other blocks are constants.
     """
-    block: VectorRows = system.blocks[0]
+    block = system.blocks[0]
+    if not isinstance(block, VectorRows):
+        raise TypeError(f"gradients need full-vector samples as first rows, not {type(block).__name__}")
     still = System(system.knots, system.components, [block.detached(), *system.blocks[1:]], system.damping)
     prepared = PreparedSystem(still)
     solution, factor = solve_direct(prepared, tolerance=tolerance, strict=strict)
     x = _ImplicitSolve.apply(block.weight, block.target, still.blocks[0], solution, factor, prepared)
-    return Solution(x, solution.gradient, solution.iterations, solution.reason, solution.solver), factor
+    return Solved(replace(solution, x=x), factor)

@@ -1,30 +1,68 @@
 """LSQR with weights inside the bidiagonalisation, stopping on a gradient that is recomputed.
 
-C. Paige and M. Saunders, LSQR, ACM TOMS 8 (1982); thesis algorithm 2 and eqs. 3.23-3.25. The recurrence's
-own estimate of the gradient drifts from the truth (in single precision it claims 1e-10 where the truth
-stalls near 1e-4), so it only says when to look: the stop is decided on the gradient recomputed in float64,
-and a run whose recurrence was wrong is restarted from where it stands (iterative refinement).
+C. Paige and M. Saunders, LSQR, ACM TOMS 8 (1982); Grønli 2017, eq. 3.23, eq. 3.24, eq. 3.25 and algorithm 2. The
+recurrence's own estimate of the gradient drifts from the truth (in single precision it claims 1e-10 where the truth
+stalls near 1e-4), so it only says when to look: the stop is decided on the gradient recomputed in float64, and a run
+whose recurrence was wrong is restarted from where it stands (iterative refinement).
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol
 
 import torch
 
 from regularize.errors import InvalidInput, NotConverged
+from regularize.rows.operators import System
+from regularize.rows.sparse import sparse_operators
+
+from .interface import Limits, Neighbour, Solution, Solved
 
 Apply = Callable[[torch.Tensor], torch.Tensor]
 
 
-@dataclass(frozen=True)
-class Solution:
-    """``x`` (unknowns,); ``gradient``: true |A'W(W b - W A x) - damp^2 x| / |A'W W b|; iterations; reason."""
+class Method(Protocol):
+    """:func:`lsqr` and what is called alike."""
 
-    x: torch.Tensor
-    gradient: float
-    iterations: int
-    reason: str
-    solver: str = "lsqr"
+    def __call__(
+        self,
+        matvec: Apply,
+        rmatvec: Apply,
+        b: torch.Tensor,
+        *,
+        damping: float,
+        tolerance: float,
+        max_iterations: int,
+        strict: bool,
+    ) -> Solution: ...
+
+
+@dataclass(frozen=True)
+class Krylov:
+    """The registered solver for a method on rows that are applied, or stored."""
+
+    method: Method
+
+    @property
+    def factors(self) -> bool:
+        return False
+
+    @property
+    def starts_from_neighbour(self) -> bool:
+        return False
+
+    def solve(self, system: System, limits: Limits, neighbour: Neighbour | None = None) -> Solved:
+        matvec, rmatvec = sparse_operators(system) if limits.stored else (system.matvec, system.rmatvec)
+        solution = self.method(
+            matvec,
+            rmatvec,
+            system.target(),
+            damping=system.damping,
+            tolerance=limits.tolerance,
+            max_iterations=limits.max_iterations,
+            strict=limits.strict,
+        )
+        return Solved(solution)
 
 
 def lsqr(
@@ -45,8 +83,8 @@ def lsqr(
     3.24 and 3.25. Raises NotConverged, unless ``strict`` is False, when the true relative gradient stays
     above ``tolerance``.
     """
-    options = {"damping": damping, "tolerance": tolerance, "max_iterations": max_iterations, "strict": strict}
-    return iterate("lsqr", _run, matvec, rmatvec, b, weight, **options)
+    limits = Limits(tolerance, max_iterations, strict)
+    return iterate("lsqr", _run, matvec, rmatvec, b, weight, damping, limits)
 
 
 def iterate(
@@ -56,13 +94,11 @@ def iterate(
     rmatvec: Apply,
     b: torch.Tensor,
     weight: torch.Tensor | None,
-    *,
     damping: float,
-    tolerance: float,
-    max_iterations: int,
-    strict: bool,
+    limits: Limits,
 ) -> Solution:
     """Run a Krylov method, look at the true gradient, and restart it on the residual while that helps."""
+    tolerance, max_iterations = limits.tolerance, limits.max_iterations
     if tolerance <= 0:
         raise InvalidInput(f"tolerance is {tolerance}: it must be positive")
     w = torch.ones_like(b) if weight is None else weight.to(b.dtype)
@@ -76,8 +112,10 @@ def iterate(
     while done < max_iterations:
         residual, before = w64 * (b64 - matvec(x)), true
         process = GolubKahan(lambda v: w * matvec(v), lambda u: rmatvec(w * u), residual, x, damping, b.dtype)
-        step, used = run(process, tolerance * scale, max_iterations - done) if process.alpha else (0.0, 0)
-        x = x + step
+        used = 0
+        if process.alpha:
+            step, used = run(process, tolerance * scale, max_iterations - done)
+            x = x + step
         done += max(used, 1)
         true = float((rmatvec(w64 * (w64 * (b64 - matvec(x)))) - damping**2 * x).norm()) / scale
         if true <= tolerance:
@@ -86,7 +124,7 @@ def iterate(
             reason = "stalled at the precision of the arithmetic"
             break
     solution = Solution(x.to(b.dtype), true, done, reason, name)
-    if strict:
+    if limits.strict:
         raise NotConverged(
             f"{name}: true relative gradient {true:.2e} after {done} iterations ({reason}), asked for "
             f"{tolerance:.1e}; raise max_iterations or the tolerance, use float64, or solve directly",

@@ -5,7 +5,8 @@ D. Fong and M. Saunders, SIAM J. Sci. Comput. 33 (2011) 2950. Stopping and weigh
 
 import torch
 
-from .krylov import Apply, GolubKahan, Solution, iterate
+from .interface import Limits, Solution
+from .krylov import Apply, GolubKahan, iterate
 
 
 def lsmr(
@@ -20,8 +21,8 @@ def lsmr(
     strict: bool = True,
 ) -> Solution:
     """Minimise |w * (A x - b)|^2 + damping^2 |x|^2; arguments and errors as :func:`regularize.lsqr`."""
-    options = {"damping": damping, "tolerance": tolerance, "max_iterations": max_iterations, "strict": strict}
-    return iterate("lsmr", _run, matvec, rmatvec, b, weight, **options)
+    limits = Limits(tolerance, max_iterations, strict)
+    return iterate("lsmr", _run, matvec, rmatvec, b, weight, damping, limits)
 
 
 def _run(process: GolubKahan, aim: float, limit: int) -> tuple[torch.Tensor, int]:

@@ -7,16 +7,53 @@ nearly the inverse of the next one's matrix: a handful of iterations replaces as
 
 import torch
 
-from regularize.errors import NotConverged
+from regularize.errors import InvalidInput, NotConverged
+from regularize.rows.operators import System
 
-from .direct import Factor, PreparedSystem
-from .krylov import Solution
+from .direct import solve_direct
+from .interface import CholeskyFactor, Limits, Neighbour, Solution, Solved
+from .prepared import PreparedSystem
+
+ITERATIONS = 25  # about what a factorisation costs
+
+
+class NeighbourGradients:
+    """The registered solver: from a neighbouring frame, or directly where there is none or it is too different."""
+
+    @property
+    def factors(self) -> bool:
+        return True
+
+    @property
+    def starts_from_neighbour(self) -> bool:
+        return True
+
+    def solve(self, system: System, limits: Limits, neighbour: Neighbour | None = None) -> Solved:
+        if neighbour is None:
+            return solve_direct(system, tolerance=limits.tolerance, strict=limits.strict)
+        if neighbour.factor is None or neighbour.knots != system.knots:
+            raise InvalidInput(
+                "neighbour holds no factor of the same knot grid: fit it with solver='pcg' and the same box"
+            )
+        prepared, start = PreparedSystem(system), neighbour.coefficients
+        solution = pcg(
+            prepared,
+            neighbour.factor,
+            start=start,
+            tolerance=limits.tolerance,
+            max_iterations=ITERATIONS,
+            strict=False,
+        )
+        if solution.gradient <= limits.tolerance:
+            return Solved(solution, neighbour.factor)
+        # a neighbour too different costs more iterations than a factorisation of its own
+        return solve_direct(prepared, tolerance=limits.tolerance, strict=limits.strict)
 
 
 class NeighbourPreconditioner:
     """Applies another system's inverse on the coefficients both touch, and the diagonal's on the others."""
 
-    def __init__(self, prepared: PreparedSystem, factor: Factor) -> None:
+    def __init__(self, prepared: PreparedSystem, factor: CholeskyFactor) -> None:
         old, new = factor.ordering, prepared.ordering
         self.factor = factor
         place = torch.full((new.knots.nodes,), -1, dtype=torch.int64, device=old.nodes.device)
@@ -36,7 +73,7 @@ class NeighbourPreconditioner:
 
 def pcg(
     prepared: PreparedSystem,
-    factor: Factor,
+    factor: CholeskyFactor,
     *,
     start: torch.Tensor | None = None,
     tolerance: float = 1e-6,

@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 
 from regularize.rows.operators import System, VectorRows
 from regularize.rows.ordering import Ordering
-from regularize.solvers.direct import Factor
+from regularize.solvers.factor import Factor
 
 CENTRES = 500  # samples whose neighbours are looked at
 REACH = 6.0  # typical distances between samples over which correlation is looked for
@@ -105,7 +105,10 @@ class CorrelatedErrors:
         self, system: System, ordering: Ordering, factor: Factor, weight: torch.Tensor, precision: float
     ) -> None:
         self.system, self.ordering, self.factor, self.precision = system, ordering, factor, precision
-        self.fit: VectorRows = system.blocks[0]
+        fit = system.blocks[0]
+        if not isinstance(fit, VectorRows):
+            raise TypeError(f"correlated errors are those of full vectors, not of {type(fit).__name__}")
+        self.fit = fit
         self.rows = self.fit.with_unit_weight().repeated(DRAWS * system.components)
         self.weight = weight[:, None, None]
         self.points = torch.tensor(self.fit.knots.spacing) * (self.fit.cell + self.fit.t)

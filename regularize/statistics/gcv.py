@@ -11,7 +11,7 @@ import torch
 from scipy.optimize import minimize_scalar
 
 from regularize.solvers.banded import widen
-from regularize.solvers.direct import Factor
+from regularize.solvers.factor import Factor
 
 from .likelihood import PROBES, SHARPEST, Choice, LikelihoodSearch, Precisions
 

@@ -21,7 +21,8 @@ from regularize.basis.knots import Knots
 from regularize.rows.operators import CellRows, DivergenceRows, RowBlock, System, VectorRows
 from regularize.rows.ordering import Ordering, order
 from regularize.solvers.banded import multiply, widen
-from regularize.solvers.direct import SHIFT, Factor, PreparedSystem
+from regularize.solvers.factor import Factor
+from regularize.solvers.prepared import SHIFT, PreparedSystem
 
 from .robust import inflation, robust_weight
 
@@ -128,7 +129,7 @@ class _Alike:
         knots, self.block, self.ordering = ordering.knots, block, ordering
         if isinstance(block, CellRows):
             self.band = PreparedSystem(System(knots, 1, [block], 0.0), ordering).band()
-            self.right = self.size = 0.0
+            self.right, self.size = torch.zeros(()), 0.0
             return
         one = block.component(0)
         self.band = PreparedSystem(System(knots, 1, [one], 0.0), ordering).band()
@@ -170,8 +171,7 @@ class LikelihoodSearch:
         self.slip = None if groups.slip is None else _Alike(groups.slip, self.ordering)
         self.divergence = None if groups.divergence is None else _Coupled(groups.divergence, self.ordering)
         silent = VectorRows(knots, groups.points, groups.velocity, torch.zeros_like(groups.weight)[:, None])
-        fixed = System(knots, self.components, [silent, *groups.fixed], groups.damping)
-        fixed = PreparedSystem(fixed, self.ordering)
+        fixed = PreparedSystem(System(knots, self.components, [silent, *groups.fixed], groups.damping), self.ordering)
         self.fixed, self.fixed_right = fixed.band(), fixed.gradient()
         generator = torch.Generator().manual_seed(0)  # fixed probes: the same data give the same choice
         shape = (len(self.ordering.nodes), self.components * PROBES)
@@ -206,18 +206,18 @@ class LikelihoodSearch:
         return Choice(noise_each, curvature, no_slip, divergence, self.groups.order, self.factor, count, settled)
 
     def _round(self, now: Precisions) -> Precisions:
-        prior, right = self.prior(now)
-        posterior = Factor(prior + widen(self.data.band, now.fit), self.ordering)
-        prior = Factor(prior, self.ordering)
+        band, right = self.prior(now)
+        posterior = Factor(band + widen(self.data.band, now.fit), self.ordering)
+        prior = Factor(band, self.ordering)
         x = posterior.solve(right + now.fit * self.data.right)
         new_fit, scale = self._noise(x, now.fit, posterior), self.scale(now.fit)
         low, high = (self.roughness(scale, factor * self.step) for factor in (SHARPEST, 1 / SHARPEST))
         rough = now.rough * self._step(prior, posterior, self.rough_probes, self.curvature.energy(x))
         rough, slip, free = min(max(rough, low), high), now.slip, now.divergence
-        if slip > 0:
+        if self.slip is not None and slip > 0:
             slip *= self._step(prior, posterior, self.slip_probes, self.slip.energy(x))
             slip = min(slip, scale / SHARPEST**2)
-        if free > 0:
+        if self.divergence is not None and free > 0:
             free *= self._step(prior, posterior, self.divergence_probes, self.divergence.energy(x))
             free = min(free, scale * self.longest**2)
         if self.robust is not None:
@@ -229,10 +229,10 @@ class LikelihoodSearch:
         scale, one = self.scale(now.fit), torch.ones(self.components, dtype=torch.float64)
         prior = scale * self.fixed + widen(self.curvature.band, now.rough * one)
         right = scale * self.fixed_right
-        if now.slip > 0:
+        if self.slip is not None and now.slip > 0:
             prior += widen(self.slip.band, now.slip * one)
             right = right + now.slip * self.slip.right
-        if now.divergence > 0:
+        if self.divergence is not None and now.divergence > 0:
             prior.add_(self.divergence.band, alpha=now.divergence)
         # stiff penalties over a breath of damping may lose definiteness to round-off
         prior[:, 0] += SHIFT * prior[:, 0].max()
@@ -269,7 +269,8 @@ class LikelihoodSearch:
         """Judge the samples anew by their distance from the fit with coefficients x (active, C)."""
         fitted = self.fit.matvec(self.ordering.expand(x)).view(-1, self.components)
         residual = self.groups.velocity - fitted / self.groups.weight[:, None]
-        self._weigh(robust_weight(residual, self.robust))
+        if self.robust is not None:
+            self._weigh(robust_weight(residual, self.robust))
 
     def _weigh(self, factor: torch.Tensor) -> None:
         """Take robust factors (n,) into the data group and its unpenalised fit."""
@@ -278,12 +279,12 @@ class LikelihoodSearch:
         rows = VectorRows(self.fit.knots, self.groups.points, self.groups.velocity, weight[:, None])
         self.data = _Alike(rows, self.ordering)
         ridge = self.roughness(float(weight.double().square().sum()), RIDGE * self.step)
-        factor = Factor(self.data.band + ridge * self.curvature.band, self.ordering)
-        self.unpenalised = factor.solve(self.data.right[:, None]).squeeze(1)
+        ridged = Factor(self.data.band + ridge * self.curvature.band, self.ordering)
+        self.unpenalised = ridged.solve(self.data.right[:, None]).squeeze(1)
         # rank = tr((S + R)^-1 S) = unknowns - tr((S + R)^-1 R) for the ridge R
         probe = self.rough_probes[:, :1]
-        self.rank = len(probe) - ridge * float((probe * factor.solve(probe)).sum()) / PROBES
-        self.data_probes = factor.spread(self.signs).view(len(probe), self.components, PROBES)
+        self.rank = len(probe) - ridge * float((probe * ridged.solve(probe)).sum()) / PROBES
+        self.data_probes = ridged.spread(self.signs).view(len(probe), self.components, PROBES)
 
     @staticmethod
     def _settled(old: Precisions, new: Precisions) -> bool:

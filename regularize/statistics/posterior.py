@@ -10,8 +10,7 @@ as wide as the band.
 import torch
 
 from regularize.basis.knots import Knots
-from regularize.solvers.block import BlockFactor
-from regularize.solvers.direct import Factor
+from regularize.solvers.interface import CholeskyFactor
 
 
 class Posterior:
@@ -21,7 +20,7 @@ class Posterior:
     """
 
     def __init__(
-        self, factor: Factor | BlockFactor, precision: float, components: int, inflation: torch.Tensor | None = None
+        self, factor: CholeskyFactor, precision: float, components: int, inflation: torch.Tensor | None = None
     ) -> None:
         self.ordering, self.components, self.precision = factor.ordering, components, precision
         self.inflation = torch.ones(components, dtype=torch.float64) if inflation is None else inflation

@@ -1,24 +1,41 @@
-"""Small systems that several tests of the spline solver share."""
+"""Small systems that several tests of the splines share; the batteries run over what `blocks_of` lists."""
 
 import torch
 
-from regularize import CellRows, DirectionRows, DivergenceRows, Knots, VectorRows
+from regularize import CellRows, DirectionRows, DivergenceRows, Knots, System, VectorRows
 from regularize.rows.penalties import curvature_gram, divergence_gram, row_factor
 
+AXES = (2, 3)
 
-def make(axes, degree=3, components=None, n=40):
+
+def dense_of(operator):
+    """(rows, unknowns): what an operator or a block of rows makes of the unit vectors, column after column."""
+    size = operator.knots.nodes * operator.components
+    shape = (size,) if isinstance(operator, System) else (operator.knots.nodes, operator.components)
+    eye = torch.eye(size, dtype=torch.float64)
+    return torch.stack([operator.matvec(column.view(shape)) for column in eye], dim=1)
+
+
+def system_of(axes, degree=3, damping=0.1, beyond=0.0):
+    """Every kind of row block in one system, on a box that reaches ``beyond`` the points."""
+    knots, blocks = blocks_of(axes, degree, beyond)
+    return System(knots, axes, list(blocks.values()), damping)
+
+
+def make(axes, degree=3, components=None, n=40, beyond=0.0):
     generator = torch.Generator().manual_seed(axes)
     components = axes if components is None else components
     upper = torch.tensor((4.0, 3.0, 2.0)[:axes], dtype=torch.float64)
-    knots = Knots.covering((0.0,) * axes, upper.tolist(), (1.0, 0.8, 0.9)[:axes], degree)
+    knots = Knots.covering((0.0,) * axes, (upper + beyond).tolist(), (1.0, 0.8, 0.9)[:axes], degree)
     points = torch.rand(n, axes, generator=generator, dtype=torch.float64) * upper
     draw = torch.rand(n, components, generator=generator, dtype=torch.float64)
     weight = torch.rand(n, generator=generator, dtype=torch.float64)
     return knots, points, draw, weight, components
 
 
-def blocks_of(axes, degree=3):
-    knots, points, draw, weight, components = make(axes, degree)
+def blocks_of(axes, degree=3, beyond=0.0):
+    """The knots, and one block of each kind by name: a kind added here is tested by every battery."""
+    knots, points, draw, weight, components = make(axes, degree, beyond=beyond)
     cells = knots.cell_index(torch.unique(knots.cell_number(knots.locate(points)[0])))
     blocks = {
         "vector": VectorRows(knots, points, draw, weight[:, None] * (1 + draw)),

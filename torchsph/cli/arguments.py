@@ -20,6 +20,7 @@ class Parser(argparse.ArgumentParser):
     """An argument parser whose complaint is one line; the usage is behind `--help`."""
 
     def error(self, message: str) -> NoReturn:
+        """Leave with code 2 and one line."""
         self.exit(2, f"{self.prog}: error: {' '.join(message.split())} (see {self.prog} --help)\n")
 
 

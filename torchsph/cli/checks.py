@@ -11,6 +11,7 @@ import geometry
 
 
 def full_vectors(recording: geometry.Recording, path: str | Path) -> geometry.Recording:
+    """The recording, refused by its path where it holds less than full vectors."""
     if not geometry.measurement_type(recording).full:
         raise ValueError(
             f"{path}: /beam: holds one component along a beam (Doppler); the methods need full vectors, as "
@@ -20,6 +21,7 @@ def full_vectors(recording: geometry.Recording, path: str | Path) -> geometry.Re
 
 
 def usable_device(name: str) -> str:
+    """The name of a device, refused where this machine has none of it."""
     try:
         device = torch.device(name)
     except RuntimeError:
@@ -43,6 +45,7 @@ def check_spacing(spacing: float | None, recording: geometry.Recording) -> None:
 
 
 def output_file(name: str) -> Path:
+    """The path of a file that may be written, refused where it may not."""
     path = Path(name)
     if path.is_dir():
         raise ValueError(f"--out {path}: is a folder; name a file")

@@ -20,7 +20,7 @@ DEBUG = "TORCHSPH_TRACEBACK"
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code (argparse itself leaves with 2 by `SystemExit`)."""
-    from .commands import build_parser
+    from .program import build_parser
 
     args = build_parser().parse_args(arguments)
     try:

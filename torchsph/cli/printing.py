@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 
-from torchsph._version import __version__
+from torchsph import __version__
 
 
 def run_config(args: argparse.Namespace, **extra: Any) -> dict[str, Any]:

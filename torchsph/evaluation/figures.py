@@ -18,7 +18,7 @@ import geometry
 
 matplotlib.use("Agg")  # no screen is needed, and none is asked for
 from matplotlib import pyplot as plt  # noqa: E402
-from matplotlib.collections import LineCollection  # noqa: E402
+from matplotlib.collections import LineCollection, QuadMesh  # noqa: E402
 
 from . import slices  # noqa: E402
 from .frames import matching_frames  # noqa: E402
@@ -104,7 +104,7 @@ def _cuts_of(recording: geometry.Recording, plane: slices.Plane, pixel: float) -
     return [slices.cut(recording, velocity[f], f, plane, pixel) for f in range(len(recording.time))]
 
 
-def _draw_cut(axis: matplotlib.axes.Axes, picture: slices.Cut, top: float, arrows: float):
+def _draw_cut(axis: matplotlib.axes.Axes, picture: slices.Cut, top: float, arrows: float) -> QuadMesh:
     mm = 1e3
     image = axis.pcolormesh(
         mm * picture.across,

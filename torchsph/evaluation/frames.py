@@ -30,6 +30,7 @@ def matching_frames(times: np.ndarray, among: np.ndarray, what: str) -> np.ndarr
 
 
 def on_frames_of(other: geometry.Recording, recording: geometry.Recording, what: str) -> geometry.Recording:
+    """The frames of `other` at the times of `recording`, refused where its grid is another one."""
     mine, its = recording.grid, other.grid
     same = tuple(mine.shape) == tuple(its.shape) and np.allclose(mine.spacing, its.spacing, rtol=1e-6)
     if not same or not np.allclose(mine.origin, its.origin, atol=1e-3 * float(np.min(mine.spacing))):

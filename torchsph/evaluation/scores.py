@@ -24,6 +24,8 @@ def square_sums(field: np.ndarray, mask: np.ndarray) -> np.ndarray:
 
 
 def rms_score(sums: np.ndarray, counts: np.ndarray, scale: float | None) -> Score:
+    """Root mean squares from sums (T,) and counts (T,) of the frames, over a scale."""
+
     def score(total: float, count: float) -> float | None:
         root = root_mean(total, count)
         return None if root is None or not scale else root / scale
@@ -32,9 +34,11 @@ def rms_score(sums: np.ndarray, counts: np.ndarray, scale: float | None) -> Scor
 
 
 def root_mean(total: float, count: float) -> float | None:
+    """Root of a total over a count, None over nothing."""
     mean = ratio(total, count)
     return None if mean is None else float(np.sqrt(mean))
 
 
 def ratio(total: float, count: float) -> float | None:
+    """A total over a count, None over nothing."""
     return float(total) / float(count) if count > 0 else None

@@ -290,24 +290,6 @@ class Backend(ABC):
         """
 
 
-def per_particle(value: float | Tensor, member: Tensor) -> float | Tensor:
-    """A coefficient given per member, (members,), spread over the particles (N,); a float stays a float."""
-    return value.index_select(0, member) if isinstance(value, Tensor) and value.ndim else value
-
-
-def inner(first: Tensor, second: Tensor) -> Tensor:
-    """Inner products (N,) of vectors (N, D), column by column: less than a reduction over so short an axis takes."""
-    total = first[:, 0] * second[:, 0]
-    for axis in range(1, first.shape[1]):
-        total = torch.addcmul(total, first[:, axis], second[:, axis])
-    return total
-
-
-def square_length(vectors: Tensor) -> Tensor:
-    """|v|^2 (N,) of vectors (N, D)."""
-    return inner(vectors, vectors)
-
-
 def check_search(position: Tensor | None, radius: float, period: Tensor | None) -> None:
     """Raise ValueError where no backend could search: non-finite positions, or a period under three radii.
 

@@ -1,129 +1,29 @@
-"""Between grids and particles: impose a velocity grid on particles, fetch particle velocities onto grid nodes.
+"""From grids to particles: velocities at points by moving least squares over the nodes around, and beyond a mask.
 
-Both are first-order moving least squares (MLS) with a compact weight, gathered by the receiving side only, so linear
-fields are reproduced exactly wherever the neighbourhood is not degenerate (the thesis's symmetric form overshoots;
-section 5.1 of the thesis asks for this cure).
+First order with a compact weight, gathered by the receiving side only, so that linear fields are reproduced exactly
+wherever the neighbourhood is not degenerate (the thesis's symmetric form overshoots; section 5.1 of the thesis asks for
+this cure). The way back is ``pairs.moving_least_squares.fetch_at``.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
 
 from geometry import Grid
-from torchsph.pairs.interface import Backend, Support
-from torchsph.pairs.smoothing_kernels import kernel
+from torchsph.pairs.moving_least_squares import first_order_value
 
-# neighbours that lie nearly in a plane, or on a line, say nothing of the slope across it: below this ratio of the
-# spread's determinant to that of a round spread of the same size, the plain average is taken
-_LEAST_ROUNDNESS = 1e-3
 _CHUNK = 1 << 15
 # summed weight, relative to full coverage, below which nothing is known
 _LEAST_SHARE = 1e-6
-
-
-@dataclass(frozen=True)
-class Fetched:
-    """Velocities at query points: value (..., D) and whether particles covered the point (...)."""
-
-    value: Tensor
-    covered: Tensor
 
 
 def wendland_weight(ratio: Tensor) -> Tensor:
     """(1 - s)^4 (1 + 4 s) for s = r / R in [0, 1), else 0 (Wendland C2)."""
     gap = (1.0 - ratio).clamp_min(0.0)
     return gap**4 * (1.0 + 4.0 * ratio)
-
-
-def first_order_value(moment0: Tensor, moment1: Tensor, moment2: Tensor, value0: Tensor, value1: Tensor) -> Tensor:
-    """MLS value at the origin from moments of a weight w over offsets s and values A.
-
-    Args: sums of w (M,), w s (M, D), w s (x) s (M, D, D), w A (M, C), w s (x) A (M, D, C).
-    Returns (M, C): a of the weighted fit A ~ a + s . b; 0 where the sum of w is 0.
-    """
-    safe = torch.where(moment0 > 0, moment0, torch.ones_like(moment0))
-    mean = value0 / safe[:, None]
-    # eliminate a: (M2 - m1 m1' / m0) b = m1A - m1 m0A / m0
-    spread = moment2 - moment1[:, :, None] * moment1[:, None, :] / safe[:, None, None]
-    right = value1 - moment1[:, :, None] * mean[:, None, :]
-    slope = solve_small(spread, right)
-    value = mean - (moment1[:, :, None] * slope).sum(1) / safe[:, None]
-    return torch.where(moment0[:, None] > 0, value, torch.zeros_like(value))
-
-
-def solve_small(matrix: Tensor, right: Tensor) -> Tensor:
-    """Solve (M, D, D) x = (M, D, C) for D = 2, 3 by cofactors (a batched LAPACK call costs ten times as much).
-
-    Symmetric, not negative; where the matrix is nearly singular (``_LEAST_ROUNDNESS``) the answer is 0.
-    """
-    dimension = matrix.shape[-1]
-    if dimension == 2:
-        a, b, c, d = matrix[:, 0, 0], matrix[:, 0, 1], matrix[:, 1, 0], matrix[:, 1, 1]
-        rows = [torch.stack([d, -b], 1), torch.stack([-c, a], 1)]
-        determinant = a * d - b * c
-    else:
-        x, y, z = matrix.unbind(2)  # columns
-        rows = [torch.linalg.cross(y, z), torch.linalg.cross(z, x), torch.linalg.cross(x, y)]
-        determinant = (x * rows[0]).sum(1)
-    round_one = (matrix.diagonal(dim1=1, dim2=2).sum(1) / dimension) ** dimension
-    regular = determinant > _LEAST_ROUNDNESS * round_one
-    inverse = torch.where(regular, 1.0 / torch.where(regular, determinant, torch.ones_like(determinant)), 0.0)
-    return torch.stack(rows, 1) @ right * inverse[:, None, None]
-
-
-def fetch_at(
-    backend: Backend,
-    points: Tensor,
-    point_member: Tensor,
-    position: Tensor,
-    member: Tensor,
-    value: Tensor,
-    radius: float,
-    *,
-    period: Tensor | None = None,
-    widen: int = 2,
-    weight: Tensor | None = None,
-) -> Fetched:
-    """Particle values at points by first-order MLS.
-
-    Args:
-        points: (M, D). point_member: (M,) int64.
-        position: (N, D), member: (N,), value: (N, C) of the particles; same units as ``points``.
-        radius: support of the weight. A point with fewer than D + 1 particles inside it is tried again with 1.5x the
-            radius, ``widen`` times.
-        weight: (N,), not negative, of the particles; None: all alike.
-
-    Returns:
-        ``Fetched`` with value (M, C) and covered (M,); uncovered points hold 0.
-    """
-    dimension = points.shape[1]
-    total = value.new_zeros((points.shape[0], value.shape[1]))
-    covered = torch.zeros(points.shape[0], dtype=torch.bool, device=points.device)
-    open_points = torch.arange(points.shape[0], device=points.device)
-    for _ in range(widen + 1):
-        if open_points.numel() == 0:
-            break
-        support = Support(kernel("wendland_c2"), 0.5 * radius, dimension)
-        m = backend.interpolate(
-            position,
-            member,
-            value,
-            support,
-            points[open_points],
-            point_member[open_points],
-            period=period,
-            weight=weight,
-        )
-        some = first_order_value(m.value, m.first, m.second, m.field, m.field_first)
-        enough = m.count > dimension
-        total[open_points[enough]] = some[enough]
-        covered[open_points[enough]] = True
-        open_points = open_points[~enough]
-        radius *= 1.5
-    return Fetched(total, covered)
 
 
 def impose_at(
@@ -200,14 +100,25 @@ def pulled(points: Tensor, velocity: Tensor, grid: Grid, target: Tensor, gain: T
     return torch.where(known, moved, velocity)
 
 
-def fill_beyond(field: Tensor, mask: Tensor, grid: Grid, domain: object, layers: int = 3) -> Tensor:
+def fill_beyond(
+    field: Tensor,
+    mask: Tensor,
+    grid: Grid,
+    walls: Callable[[Tensor], tuple[Tensor, Tensor]] | None,
+    layers: int = 3,
+) -> Tensor:
     """Continue a field beyond its mask, so that interpolation near the edge mixes in nothing foreign.
 
     Behind a wall stands the wall's velocity (no slip); in an open channel, or where there are no walls, the mean of
     the known neighbours continues outward, layer by layer.
 
     Args:
-        field: (B, D, *shape), m/s. mask: (*shape) bool. domain: gives ``sample`` and ``units`` (see ``Domain``).
+        field: (B, D, *shape), m/s.
+        mask: (*shape) bool, where it is known.
+        grid: the nodes, m.
+        walls: gives distance (n,), positive in the fluid, and velocity (n, D), m/s, of the walls at points (n, D)
+            float64, m; None: there are none.
+        layers: nodes beyond the mask that are filled.
     """
     known = mask.clone()
     filled = torch.where(mask, field, torch.zeros_like(field))
@@ -216,14 +127,12 @@ def fill_beyond(field: Tensor, mask: Tensor, grid: Grid, domain: object, layers:
         fresh = ~known & (count[0, 0] > 0)
         filled = torch.where(fresh, total / count.clamp_min(1.0), filled)
         known = known | fresh
-    if domain.walls is None:
+    if walls is None:
         return filled
     beyond = torch.nonzero((known & ~mask).reshape(-1)).squeeze(1)
-    points = grid.nodes(dtype=torch.float64, device=field.device)[beyond] / domain.units.length
-    wall = domain.sample_at(points.to(field.dtype))
-    solid = beyond[wall.distance < 0]
+    distance, velocity = walls(grid.nodes(dtype=torch.float64, device=field.device)[beyond])
     flat = filled.reshape(*filled.shape[:2], -1).clone()
-    flat[:, :, solid] = wall.velocity[wall.distance < 0].T * domain.units.speed
+    flat[:, :, beyond[distance < 0]] = velocity[distance < 0].T
     return flat.reshape(filled.shape)
 
 

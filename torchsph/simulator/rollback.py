@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from .schemes.weakly_compressible import Rollback
+from .schemes.parts import Rollback
 from .state.particles import Particles
 from .state.record import Record
 

@@ -5,32 +5,30 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import torch
 from torch import Tensor
 
 from geometry import Grid
-from torchsph.pairs import backend as choose_backend
+from torchsph.pairs.interface import Backend
+from torchsph.pairs.moving_least_squares import Fetched, fetch_at
 
-from .imposing import Fetched, fetch_at, pulled
+from .domain import Domain
+from .imposing import pulled
 from .population import Population
 from .rollback import Checkpoints
-from .schemes.projection import Projection
-from .schemes.weakly_compressible import CompleteKernelWall
+from .scene import Scene
+from .schemes.scheme import Scheme
 from .state.neighbour_list import PairSearch
 from .state.particles import Particles, held, held_rows
 from .state.record import Record
 from .stepping.coefficients import Coefficients, Parameters
 from .stepping.pressure import Neighbourhood, divergence_free
-from .stepping.projection import ProjectionStepper, check_filled
 from .stepping.step_length import StepControl
-from .stepping.weakly_compressible import Stepper
-from .valves.pressure_reservoirs import PressureValves
+from .stepping.stepper import make_stepper
+from .surroundings import PresentSurroundings
 from .work import WorkAccount
-
-if TYPE_CHECKING:
-    from .simulator import Simulator
 
 # how far particles move before the neighbours are searched again, in spacings
 _SEARCH_MARGIN = 0.25
@@ -42,43 +40,86 @@ _MOST_STEPS = 1e7
 FETCH_RADIUS = 2.0
 
 
+# particles that fill less of their walls leave a free surface
+_LEAST_FILLING = 0.9
+
+
+def check_filled(domain: Domain, particles: Particles, time: float) -> None:
+    """ValueError where fluid does not fill its walls, or its box, though the scheme knows of no free surface."""
+    if not domain.scheme.must_fill or particles.count == 0:
+        return
+    filling = float(domain.filling(particles, time).min())
+    if filling < _LEAST_FILLING:
+        raise ValueError(
+            f"the particles fill {100 * filling:.0f} % of what encloses them, so the fluid has a free surface: give "
+            "Projection(surface=0.85), or step with the weakly compressible scheme"
+        )
+
+
 class NumericalFailure(RuntimeError):
     """Every member of a run has failed; the record says how far each came."""
 
 
+class Model(Protocol):
+    """What runs come from (``Simulator``)."""
+
+    @property
+    def scene(self) -> Scene:
+        """What is simulated."""
+
+    @property
+    def scheme(self) -> Scheme:
+        """How it is stepped."""
+
+    @property
+    def backend(self) -> str:
+        """Name of the pair backend."""
+
+    @property
+    def device(self) -> str:
+        """Where particles live."""
+
+    def resume(self, particles: Particles, time: float) -> Simulation:
+        """Another run, from given particles on."""
+
+
 class Simulation:
-    """A batch of members on their way through time.  Particles and record change; the simulator does not.
+    """A batch of members on their way through time.  Particles and record change; the domain does not.
 
     Attributes:
+        simulator: what the run comes from, where a ``Simulator`` has made it.
+        domain: walls, valves and forces.
+        surroundings: what particles see of them at their present times.
+        units: internal units.
         particles: the flat set of all members, internal units.
         parameters: the numbers of the scheme in use; see ``change``.
         record: accounts of the run.
         time: present time, s.
     """
 
-    def __init__(self, simulator: Simulator, particles: Particles, time: float) -> None:
-        self.simulator, self.particles, self.time = simulator, particles, float(time)
-        self.domain, self.units = simulator.domain, simulator.domain.units
-        scene, scheme = simulator.scene, simulator.scheme
+    simulator: Model
+
+    def __init__(self, domain: Domain, backend: Backend, particles: Particles, time: float) -> None:
+        self.domain, self.units, self.particles, self.time = domain, domain.units, particles, float(time)
+        self.surroundings, self._backend = PresentSurroundings(domain), backend
+        scene, scheme = domain.scene, domain.scheme
         self.record = Record(particles.members, len(scene.valves), particles.position.device)
-        self.parameters = Parameters.of(scheme, scene.fluid)
+        self.parameters = Parameters.of(scheme, scene.fluid.viscosity)
         self._coefficients = Coefficients.of(self.parameters, self.units, scene.fluid.density)
-        self._backend = choose_backend(simulator.backend, simulator.device)
         # incompressible steps see their neighbours once; lists of that moment also make them independent of a batch
-        margin = 0.0 if isinstance(scheme, Projection) else _SEARCH_MARGIN
+        margin = _SEARCH_MARGIN if scheme.compressible else 0.0
         search = PairSearch(self._backend, self.domain.support_radius, margin, self.domain.period)
-        buffered = self.domain.reservoirs is not None
-        if isinstance(scheme, Projection):
-            check_filled(scheme, self.domain, particles, self.time)
-            self._stepper = ProjectionStepper(scheme, self._coefficients, search, scene.dimension, self.record)
-        else:
-            self._stepper = Stepper(scheme, self._coefficients, search, scene.dimension, buffered=buffered)
+        check_filled(domain, particles, self.time)
+        buffered = domain.valves.has_buffers
+        self._stepper = make_stepper(
+            scheme, self._coefficients, search, scene.dimension, self.record, buffered=buffered
+        )
         self._control = StepControl(self.record, scheme.step_floor)
-        self._work = WorkAccount.of(self.domain, self.record)
-        self._population = Population.of(self.domain, self._backend, self.record, particles, self.time)
-        self._pressures = PressureValves.of(self.domain, self._backend)
+        self._work = WorkAccount.of(domain, self.record)
+        self._population = Population.of(self.surroundings, self._backend, self.record, particles, self.time)
+        self._pressures = domain.valves.pressure_reservoirs(self._backend)
         if self._pressures is not None:
-            self._stepper.held_kinds = self._pressures.kinds
+            self._stepper.prescribed_kinds = self._pressures.kinds
         self._acceleration = torch.zeros_like(particles.position)
         self._began_at = self._imposed_at = self.time
         self._order: Tensor | None = None  # of the particles in space when they were last sorted
@@ -104,23 +145,23 @@ class Simulation:
             self._sort(self._order)
         longest = self._longest_step(until)
         for stop in self.domain.breaks(self.time, until):
-            self.domain.enter(self.time, stop, valve_strength=self.parameters.valve_strength)
-            self.particles = self.domain.prepare(self.particles)
+            self.surroundings.enter(self.time, stop, valve_strength=self.parameters.valve_strength)
+            self.particles = self.surroundings.prepare(self.particles)
             self._forget_pairs()
             self._advance_interval(stop, longest)
             self.time = stop
-            self.particles = self.domain.finish(self.particles, self.record, stop, self._stepper.pressure)
+            self.particles = self.surroundings.finish(self.particles, self.record, stop, self._stepper.pressure)
             self._forget_pairs()
         self._unsort()
         self.record.searches = self._stepper.pair_search.searches
         self.record.overflows = self._backend.overflows
-        self.domain.account(self.particles, self.record, self.time, self._began_at)
+        self.surroundings.account(self.particles, self.record, self.time, self._began_at)
 
     def _longest_step(self, until: float) -> float:
         """Limit of the steps to time ``until`` (s) that the scheme names outright, internal."""
-        scheme = self.simulator.scheme
+        scheme = self.domain.scheme
         longest = (until - self.time) / (scheme.steps_per_frame or 1)
-        if isinstance(scheme, Projection) and scheme.max_step is not None:
+        if scheme.max_step is not None:
             longest = min(longest, scheme.max_step)
         return longest / self.units.time
 
@@ -130,20 +171,18 @@ class Simulation:
         Names are those of ``Parameters``; None switches a term off. Raises ValueError where a value cannot be, or
         where the scheme has no place for it.
         """
-        scheme = self.simulator.scheme
-        changeable = ("shifting", "courant", "viscosity", "valve_strength")
-        if isinstance(scheme, Projection) and not set(values) <= set(changeable):
-            known = ", ".join(changeable)
+        scheme = self.domain.scheme
+        if scheme.changeable is not None and not set(values) <= set(scheme.changeable):
+            known = ", ".join(scheme.changeable)
             raise ValueError(f"of the incompressible scheme only {known} can change, got {list(values)}")
         if values.get("xsph") is not None and scheme.xsph is None:
             raise ValueError("parameter 'xsph' needs a scheme with XSPH, which says of what level and form it is")
-        if "valve_strength" in values and self.domain.sources is None and self._pressures is None:
+        if "valve_strength" in values and not self.domain.valves.takes_strength:
             raise ValueError("parameter 'valve_strength' needs pressure sources or valves that are given a pressure")
-        complete = self.domain.walls is not None and isinstance(scheme.wall, CompleteKernelWall)
-        if "smoothing_ratio" in values and complete:
+        if "smoothing_ratio" in values and self.domain.walls is not None and scheme.wall.complete:
             raise ValueError("the tables of a complete-kernel wall are made for the scheme's smoothing_ratio")
         self.parameters = self.parameters.changed(self.particles.velocity, self.members, **values)
-        self._coefficients = Coefficients.of(self.parameters, self.units, self.simulator.scene.fluid.density)
+        self._coefficients = Coefficients.of(self.parameters, self.units, self.domain.scene.fluid.density)
         self._stepper.use(self._coefficients)
         self._stepper.pair_search.radius = self._stepper.support.radius
         self._forget_pairs()
@@ -151,7 +190,7 @@ class Simulation:
     def _advance_interval(self, stop: float, longest: float) -> None:
         duration = (stop - self.time) / self.units.time
         done = torch.zeros(self.members, dtype=torch.float64, device=self.particles.position.device)
-        options = self.simulator.scheme.rollback
+        options = self.domain.scheme.rollback
         checkpoints = None if options is None else Checkpoints(options, self.record)
         while True:
             left = torch.where(self.record.failed, torch.zeros_like(done), duration - done)
@@ -173,18 +212,18 @@ class Simulation:
             if bool(hopeless.any()):
                 self._fail(hopeless)
                 continue
-            self.domain.at(self.time + done * self.units.time)
+            self.surroundings.at(self.time + done * self.units.time)
             self._pass_valves()
             if self._population is not None:
                 self._control_population(step > 0)
             if self._pressures is not None:
-                self.particles = self._pressures.driven(self.particles, self._stepper)
+                self.particles = self._pressures.driven(self.particles, self.surroundings.clock, self._stepper)
             self._sort_when_due()
             done = self._take_step(step, done, checkpoints)
 
     def _ramp(self, done: Tensor) -> None:
         """Let gamma grow, where the scheme has it grow."""
-        ramp = self.simulator.scheme.gamma_ramp
+        ramp = self.domain.scheme.gamma_ramp
         if ramp is None:
             return
         elapsed = self.time - self._imposed_at + done * self.units.time
@@ -196,7 +235,7 @@ class Simulation:
 
     def _pass_valves(self) -> None:
         """Particles that have crossed an open valve change sides, in every step: the flow must not feel the search."""
-        self.particles, renumbered = self.domain.exchange(self.particles, self.record, self._stepper.pressure)
+        self.particles, renumbered = self.surroundings.exchange(self.particles, self.record, self._stepper.pressure)
         if renumbered:
             self._forget_pairs()
 
@@ -240,16 +279,17 @@ class Simulation:
         """Step every member by its own ``step`` (members,); how far each has come in the interval (members,)."""
         before, push = self.particles, self._acceleration
         inner = step.to(before.position.dtype)
-        stepped, acceleration, wall = self._stepper.step(before, inner, self.record.steps, self.domain)
-        self.domain.at(self.time + (done + step) * self.units.time)
-        after = self.domain.constrain(before, stepped, wall, inner, self.record)
+        stepped, acceleration, wall = self._stepper.step(before, inner, self.record.steps, self.surroundings)
+        self.surroundings.at(self.time + (done + step) * self.units.time)
+        after = self.surroundings.constrain(before, stepped, wall, inner, self.record)
         waiting = step == 0
         if bool(waiting.any()):
             after, acceleration = held(waiting, before, after), held_rows(waiting, before, push, acceleration)
         self.particles, self._acceleration, done = after, acceleration, done + step
         broken = self._broken() & ~self.record.failed
         if self._work is not None:
-            self._work.note(before, stepped, wall, inner, self._stepper, (step > 0) & ~broken)
+            counts, by_valves = (step > 0) & ~broken, self.surroundings.valve_acceleration
+            self._work.note(before, stepped, wall, inner, self._stepper, counts, by_valves)
         if bool(broken.any()):
             done = self._recover(broken, before, push, done, checkpoints)
         return done
@@ -259,13 +299,13 @@ class Simulation:
 
         Notes the densities on the way; in an incompressible fluid they do not change.
         """
-        p, scheme = self.particles, self.simulator.scheme
+        p, scheme = self.particles, self.domain.scheme
         broken = torch.zeros_like(self.record.failed)
         # a sum is finite only if all its terms are; which they are is looked up only where it is not
         if not math.isfinite(float(p.position.sum() + p.velocity.sum() + p.deviation.sum())):
             finite = torch.isfinite(p.position).all(1) & torch.isfinite(p.velocity).all(1) & torch.isfinite(p.deviation)
             broken = p.per_member((~finite).to(torch.int64), "sum") > 0
-        if scheme.sound_speed is not None:
+        if scheme.compressible:
             lowest, highest = (p.per_member(p.deviation, way) for way in ("amin", "amax"))
             self.record.note_density(lowest, highest)
             if scheme.rollback is not None:
@@ -326,7 +366,7 @@ class Simulation:
         """
         if confidence is not None and not bool((torch.isfinite(confidence) & (confidence >= 0)).all()):
             raise ValueError("confidences must be finite and not negative")
-        self.particles = self.domain.imposed(self.particles, grid, velocity, mask, self.time)
+        self.particles = self.surroundings.imposed(self.particles, grid, velocity, mask, self.time)
         carried = None
         if confidence is not None:
             field = confidence.to(self.particles.velocity)[None]
@@ -338,7 +378,7 @@ class Simulation:
     @property
     def can_project(self) -> bool:
         """Whether ``project`` knows what the scene's walls ask for."""
-        return self.domain.walls is None or isinstance(self.simulator.scheme.wall, CompleteKernelWall)
+        return self.domain.walls is None or self.domain.scheme.wall.complete
 
     def project(self, times: int = 1) -> Tensor:
         """Make the fluid's velocities free of divergence, as the walls and the flux of open valves ask for.
@@ -349,12 +389,12 @@ class Simulation:
         """
         if not self.can_project:
             raise ValueError("projecting velocities needs complete-kernel walls; potential walls have no kernel share")
-        self.domain.enter(self.time, self.time)
-        wall = self.domain.sample(self.particles)
+        self.surroundings.enter(self.time, self.time)
+        wall = self.surroundings.sample(self.particles)
         search = self._stepper.pair_search
         here = Neighbourhood(self.particles, search, search.at(self.particles), self._stepper.support, wall)
         before = self.particles
-        self.particles = before.changed(velocity=divergence_free(here, times=times)[0])
+        self.particles = before.changed(velocity=divergence_free(here, times=times))
         mass = torch.where(before.fluid, before.mass, torch.zeros_like(before.mass)).double()
         taken, left = (
             before.per_member(mass * velocity.double().square().sum(1), "sum")

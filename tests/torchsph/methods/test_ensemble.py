@@ -7,6 +7,7 @@ import pytest
 import torch
 
 import geometry
+from geometry.grids.fields import fwhm_to_deviation, smooth_noise
 from regularize import Smoother
 from torchsph import EnsembleOptions, PreparedMeasurement, Simulator, assimilate, estimate_error, filter_sph, preset
 from torchsph.data import sample_measurement, sample_truth
@@ -15,7 +16,6 @@ from torchsph.methods.measurement.error_model import kernel_width
 from torchsph.methods.measurement.frame_splines import FrameSmoother, node_weights, smooth_frames
 from torchsph.methods.measurement.wall_rows import flux_shares, open_regions, wall_rows
 from torchsph.simulator.scene import Scene
-from torchsph.ultrasound.estimation.box_sums import fwhm_to_deviation, smooth_noise
 
 
 @pytest.fixture(scope="module")
@@ -124,7 +124,7 @@ def test_missing_velocities_have_no_weight(measured):
 def test_ensemble_and_nudging_stay_well_below_raw(measured, truth, model, prepared):
     raw = nrmse(np.nan_to_num(measured.velocity), truth, measured.mask)
     run = assimilate(prepared, model, members=4, seed=1)
-    run.recording.check("ensemble")
+    geometry.check_recording(run.recording, "ensemble")
     assert nrmse(run.recording.velocity, truth, measured.mask) < 0.5 * raw
     assert run.recording.sigma is not None
     inside = np.moveaxis(run.recording.sigma, 1, -1)[measured.mask]
@@ -132,7 +132,7 @@ def test_ensemble_and_nudging_stay_well_below_raw(measured, truth, model, prepar
     again = assimilate(prepared, model, members=4, seed=1)
     np.testing.assert_array_equal(again.recording.velocity, run.recording.velocity)
     particles = filter_sph(prepared, model, seed=1)
-    particles.recording.check("sph")
+    geometry.check_recording(particles.recording, "sph")
     assert nrmse(particles.recording.velocity, truth, measured.mask) < 0.8 * raw
 
 

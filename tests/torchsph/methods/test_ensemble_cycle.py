@@ -153,7 +153,7 @@ def test_frames_without_data_are_forecast(given, frames):
             assimilate(measured, given.model, members=2)
         return
     run = assimilate(measured, given.model, members=2, seed=1)
-    run.recording.check("ensemble")
+    geometry.check_recording(run.recording, "ensemble")
     assert run.info["coasted_frames"] == len([f for f in frames if f > 0])
     counts = run.info["filter"]["cycles"]
     for frame in frames:

@@ -16,11 +16,11 @@ from torchsph.evaluation.metrics import spread_over_skill
 from torchsph.methods.ensemble.divergence_cleaning import without_divergence
 from torchsph.methods.ensemble.forecaster import shares
 from torchsph.methods.ensemble.lagged import LaggedAnalyses
-from torchsph.methods.ensemble.regions import flow_regions
 from torchsph.methods.measurement.error_model import ObservationError
 from torchsph.methods.measurement.frame_splines import FrameSmoother
 from torchsph.methods.measurement.observation_operator import Measurement
 from torchsph.methods.measurement.prepared import PreparedMeasurement
+from torchsph.methods.measurement.regions import flow_regions
 
 
 @pytest.fixture(scope="module")

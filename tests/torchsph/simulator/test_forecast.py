@@ -64,7 +64,7 @@ def test_no_lead_gives_back_the_start_when_the_lost_detail_is_added(recording, m
 def test_saved_forecasts_are_recordings_valid_at_their_time(recording, model):
     result = skill(recording, model, (0.005,), every=2, save=True)
     saved = result.recordings[0.005]
-    saved.check("forecast")
+    geometry.check_recording(saved, "forecast")
     np.testing.assert_allclose(saved.time, recording.time[[1, 3]])
     assert saved.uncovered.tolist() == [0, 0]
 

@@ -7,7 +7,7 @@ import geometry
 from torchsph import Scene, Seeding, Simulator, preset, residual_motion
 from torchsph.pairs import RateTerms, Support, backend
 from torchsph.pairs.smoothing_kernels import kernel
-from torchsph.simulator.schemes.weakly_compressible import PotentialWall
+from torchsph.simulator.schemes.wall_models import PotentialWall
 
 BALL = geometry.WallMotion.at_rest(geometry.ellipsoid((0.01, 0.01, 0.01), 1e-3))
 SCENE = Scene(spacing=1e-3, walls=BALL)

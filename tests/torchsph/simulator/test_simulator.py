@@ -10,7 +10,7 @@ import torch
 import geometry
 from torchsph import Scene, Simulator, WeaklyCompressible, preset
 from torchsph.simulator.scene import Fluid, Valve
-from torchsph.simulator.schemes.weakly_compressible import PotentialWall
+from torchsph.simulator.schemes.wall_models import PotentialWall
 from torchsph.simulator.state.particles import Particles
 
 PERIODIC = Scene(spacing=1 / 24, fluid=Fluid(1.0, 0.02), period=(1.0, 1.0), reference_speed=1.0, dimension=2)

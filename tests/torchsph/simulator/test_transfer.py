@@ -7,8 +7,9 @@ import torch
 
 from geometry import Grid
 from torchsph.pairs import backend
+from torchsph.pairs.moving_least_squares import fetch_at
 from torchsph.pairs.registry import available_backends
-from torchsph.simulator.imposing import fetch_at, impose_at, pulled, wendland_weight
+from torchsph.simulator.imposing import impose_at, pulled, wendland_weight
 
 BACKENDS = [one.name for one in available_backends() if one.present]
 SLOPE = torch.tensor([[0.3, -1.0, 0.2], [0.5, 0.1, -0.7], [1.1, 0.4, 0.9]], dtype=torch.float64)

@@ -26,8 +26,8 @@ def rotating_patch(viscosity, dtype=torch.float64, **changes):
     position = torch.cartesian_prod(axis, axis)
     arm = (position - count / 2) * scene.spacing
     velocity = omega * torch.stack([-arm[:, 1], arm[:, 0]], 1) + torch.tensor([0.3, -0.2], dtype=dtype)
-    one, label = torch.ones_like(position[:, 0]), torch.zeros(len(position), dtype=torch.int64)
-    start = Particles(position, velocity, 0 * one, one, label, label, 1)
+    ones, label = torch.ones_like(position[:, 0]), torch.zeros(len(position), dtype=torch.int64)
+    start = Particles(position, velocity, 0 * ones, ones, label, label, 1)
     scheme = WeaklyCompressible(**(validation.FREE_SURFACE_OPTIONS | changes))
     return Simulator(scene, scheme, dtype=dtype).resume(start, 0.0)
 
@@ -118,14 +118,14 @@ def test_only_the_difference_form_is_blind_to_the_level_of_the_pressure(form):
     axis = torch.arange(12, dtype=torch.float64) + 0.5
     position = torch.cartesian_prod(axis, axis)
     position = position + 0.2 * torch.rand(position.shape, generator=generator, dtype=torch.float64)
-    one, member = torch.ones_like(position[:, 0]), torch.zeros(len(position), dtype=torch.int64)
+    ones, member = torch.ones_like(position[:, 0]), torch.zeros(len(position), dtype=torch.int64)
     support = Support(kernel("wendland_c2"), 1.3, 2)
     period = torch.full((2,), 12.0, dtype=torch.float64)
     acting = backend("auto")
     pairs = acting.search(position, member, support.radius, period=period)
     largest = {}
     for level in (-1.0, 1.0):
-        state = PairState(position, torch.zeros_like(position), one, 0 * one, level * one, member)
+        state = PairState(position, torch.zeros_like(position), ones, 0 * ones, level * ones, member)
         force = acting.momentum(pairs, state, support, MomentumTerms(pressure=form))
         largest[level] = float(force.norm(dim=1).max())
     blind = [level for level in largest if largest[level] < 1e-13]

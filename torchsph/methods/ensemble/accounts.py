@@ -6,8 +6,8 @@ import math
 import warnings
 from typing import Any
 
+from ..measurement.observation_batch import error_groups
 from .cycle import Cycle
-from .observation_batch import error_groups
 
 # a deviation of the observation errors this many times the stated one is worth a warning
 _NOISY = 2.0

@@ -23,13 +23,13 @@ from torchsph.assimilation import (
 )
 from torchsph.evaluation.frames import frame_at
 
+from ..measurement.observation_batch import ObservationBatch, error_groups, regions_of
 from ..measurement.observation_operator import Measurement
 from ..runtime.parallel import forked, shared_pair
 from .analyses import Analyses
 from .forecaster import Ensemble
 from .innovation_spline import InnovationSpline
 from .lagged import Lagged
-from .observation_batch import ObservationBatch, error_groups, regions_of
 from .options import EnsembleOptions
 
 # draws from the ensemble whose splines tell how large its spread is: each costs a thirtieth of an analysis
@@ -51,6 +51,8 @@ class Analyser:
     Attributes:
         last_increments: (J, D, *shape), m/s, of the last analysis, before they were weighted; None without one.
     """
+
+    last_increments: Tensor | None
 
     def __init__(
         self,
@@ -74,7 +76,7 @@ class Analyser:
         self.scale = ErrorScale(error_groups(measurements)[-1], memory=options.memory)
         self.record = FilterRecord(seed=seed)
         self.spline = InnovationSpline(self.splines, options.choose_every)
-        self.last_increments: Tensor | None = None
+        self.last_increments = None
 
     def analyse(self, state: Ensemble, batch: ObservationBatch, frame: int) -> tuple[Ensemble, Tensor]:
         """The analysed ensemble, and the deviation (D, *shape), m/s, that is claimed of its control."""
@@ -116,6 +118,7 @@ class Analyser:
         return {**learned, "last_increments": self.last_increments}
 
     def restore(self, state: dict[str, Any]) -> None:
+        """Go on from what ``state`` gave."""
         for name in self._LEARNED:
             getattr(self, name).restore(state[name])
         self.last_increments = state["last_increments"]

@@ -32,14 +32,16 @@ class Analyses:
         shocks: what each forecast's start lost to the projection (``Forecasts.shock``).
     """
 
+    fields: list[Tensor]
+    sigmas: list[Tensor]
+    missing: list[int]
+    events: list[dict[str, Any]]
+    shocks: list[float]
+
     def __init__(self, measured: geometry.Recording, lag: int | None) -> None:
         self.measured = measured
         self.lagged = None if lag is None else LaggedAnalyses(lag)
-        self.fields: list[Tensor] = []
-        self.sigmas: list[Tensor] = []
-        self.missing: list[int] = []
-        self.events: list[dict[str, Any]] = []
-        self.shocks: list[float] = []
+        self.fields, self.sigmas, self.missing, self.events, self.shocks = [], [], [], [], []
 
     def happened(self, frame: int, **what: Any) -> None:
         """Note an event at a frame."""
@@ -106,6 +108,7 @@ class Analyses:
         }
 
     def restore(self, state: dict[str, Any]) -> None:
+        """Go on from what ``state`` gave."""
         self.fields, self.sigmas = list(state["fields"]), list(state["sigmas"])
         self.missing, self.events, self.shocks = (list(state[name]) for name in ("missing", "events", "shocks"))
         if self.lagged is not None:

@@ -14,13 +14,13 @@ import geometry
 from torchsph.assimilation import Filter
 from torchsph.evaluation.frames import SAME_TIME
 
+from ..measurement.observation_batch import Part, gathered
 from ..measurement.observation_operator import Measurement
 from ..runtime.parallel import forked, from_last, is_last, shared
 from .analyser import Analyser
 from .analyses import Analyses
 from .forecast_spread import ForecastSpread
 from .forecaster import Ensemble, Forecaster
-from .observation_batch import Part, gathered
 from .options import EnsembleOptions
 
 
@@ -73,6 +73,7 @@ class Cycle:
         return len(self.analyses.fields)
 
     def mask(self, frame: int) -> Tensor:
+        """(*shape) bool, of a frame."""
         return torch.from_numpy(np.array(self.measured.mask[frame], bool))
 
     def begin(self) -> None:
@@ -111,7 +112,8 @@ class Cycle:
         states = self.forecast_spread.prepared(forecasts, from_last(noise), frame, self.analyser.spread_match.factor)
         missing = int((late & ~forecasts.covered).sum())
         parts = [Part(measurement, what, _nearest(times, time)) for measurement, what, time in seen]
-        batch = gathered(parts, states, masks, self.measurements, self.analyser.scale)
+        members = [state.members for state in states]
+        batch = gathered(parts, members, masks, self.measurements, self.analyser.scale)
         if batch is None:  # nothing was measured: the forecast is the analysis
             self.analyser.coast()
             self.analyses.happened(frame, coasted=True)
@@ -135,6 +137,7 @@ class Cycle:
         }
 
     def restore(self, state: dict[str, Any]) -> None:
+        """Go on from what ``state`` gave."""
         self._ensemble = Ensemble(**state["ensemble"])
         self.generator.set_state(state["generator"])
         self.analyser.restore(state["analyser"])

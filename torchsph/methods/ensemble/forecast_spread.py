@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from geometry.grids.fields import fwhm_to_deviation
 from torchsph.assimilation import replace_failed
-from torchsph.ultrasound.estimation.box_sums import fwhm_to_deviation
 
 from ..measurement.observation_operator import Measurement
 from .analyses import Analyses

@@ -11,8 +11,8 @@ from torch import Tensor
 import regularize
 
 from ..measurement.frame_splines import FrameSmoother
+from ..measurement.observation_batch import ObservationBatch
 from ..measurement.observation_operator import FrameObservations
-from .observation_batch import ObservationBatch
 
 _LEAST_CONFIDENCE = 1e-3
 
@@ -37,9 +37,11 @@ class InnovationSpline:
         self.choice: regularize.Choice | None = None
 
     def state(self) -> dict[str, Any] | None:
+        """What a checkpoint has to hold."""
         return None if self.choice is None else asdict(self.choice)
 
     def restore(self, state: dict[str, Any] | None) -> None:
+        """Go on from what ``state`` gave."""
         self.choice = None if state is None else regularize.Choice(**state)
 
     def of(self, values: Tensor, weight: Tensor, batch: ObservationBatch, frame: int) -> Tensor:

@@ -43,6 +43,7 @@ class LaggedAnalyses:
         self.kept: deque[Lagged] = deque(maxlen=lag)
 
     def add(self, frame: int, control: Tensor, anomalies: Tensor, sigma: Tensor) -> None:
+        """Keep an analysis, with the anomalies (N, D, *shape), m/s, of the ensemble that goes on from it."""
         self.kept.append(Lagged(frame, control, anomalies - anomalies.mean(0), sigma))
 
     def improved(self, analysis: Analysis, inside: Tensor, numbers: int) -> list[Lagged]:
@@ -58,6 +59,7 @@ class LaggedAnalyses:
         return [_improved(one, analysis, inside, numbers, size) for one in self.kept]
 
     def take(self, improved: Sequence[Lagged]) -> None:
+        """Make improved analyses the ones that are kept."""
         self.kept = deque(improved, self.kept.maxlen)
 
     def replaced(self, member: int, donor: int) -> None:
@@ -70,9 +72,11 @@ class LaggedAnalyses:
         self.kept.clear()
 
     def state(self) -> list[dict[str, Any]]:
+        """What a checkpoint has to hold."""
         return [dict(vars(one)) for one in self.kept]
 
     def restore(self, state: list[dict[str, Any]]) -> None:
+        """Go on from what ``state`` gave."""
         self.kept = deque((Lagged(**one) for one in state), self.kept.maxlen)
 
 

@@ -13,6 +13,7 @@ from tqdm import tqdm
 
 import geometry
 import regularize
+from regularize.solvers.factor import Factor
 
 from ..runtime.parallel import shared
 from .wall_rows import wall_rows
@@ -194,7 +195,7 @@ class FrameSmoother:
             ValueError: the fit has not kept its uncertainty.
         """
         recording, factor, posterior = self.recording, fitted.factor, fitted.posterior
-        if factor is None or posterior is None:
+        if not isinstance(factor, Factor) or posterior is None:
             raise ValueError("draws need a fit that keeps its uncertainty: fit(frame, uncertainty=True)")
         mask = torch.from_numpy(np.array(recording.mask[frame], bool).reshape(-1))
         out = torch.zeros((count, recording.dimension, recording.grid.size), dtype=torch.float64)

@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 
 import geometry
+from geometry.grids.fields import fwhm_to_deviation, masked_blur
 from geometry.recordings.measurement_types import Components
 from torchsph.assimilation import Observations, Reason
 from torchsph.evaluation.frames import SAME_TIME
-from torchsph.ultrasound.estimation.box_sums import fwhm_to_deviation, masked_blur
 
 from .frame_splines import node_weights
 from .prepared import PreparedMeasurement

@@ -46,7 +46,8 @@ def save(path: Path, key: str, state: dict[str, Any]) -> None:
 def load(path: Path, key: str) -> dict[str, Any] | None:
     """The state in ``path``, or None where there is none; of several processes the first reads for all.
 
-    Raises ValueError where it was written by another run: other options, members, seed or recordings.
+    Raises:
+        ValueError: it was written by another run: other options, members, seed or recordings.
     """
     held: list[dict[str, Any] | None] = [None]
     lead = not dist.is_initialized() or dist.get_rank() == 0

@@ -8,17 +8,8 @@ import torch
 from torch import Tensor
 
 from ..cell_search import cross_pairs, half_pairs, nearest_image
-from ..interface import (
-    Backend,
-    Moments,
-    MomentumTerms,
-    PairState,
-    Rates,
-    RateTerms,
-    Support,
-    check_search,
-    per_particle,
-)
+from ..interface import Backend, Moments, MomentumTerms, PairState, Rates, RateTerms, Support, check_search
+from ..vectors import per_particle
 
 # keeps 1 / r^2 finite for coinciding particles, in squared smoothing lengths (epsilon of 2.28)
 SINGULARITY = 0.01

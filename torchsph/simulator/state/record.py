@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from ..stepping.terms import LIMITS
+# what may limit a time step, in the order of ``stepping.terms.step_limits``
+LIMITS = ("acoustic", "viscous", "force", "frame", "end of interval")
 
 
 @dataclass
@@ -31,7 +32,7 @@ class Record:
         filling: volume of the particles inside over that of the cavity now; NaN in scenes without walls. Where a closed
             cavity changes its volume, it goes along: a weakly compressible fluid is compressed or thinned, and the
             incompressible scheme reports the mismatch below.
-        limited_by: how many steps each limit decided, (members, limits); names in ``terms.LIMITS``.
+        limited_by: how many steps each limit decided, (members, limits); names in ``LIMITS``.
         reductions: how often a limit asked for a step shorter than the step before by more than a hundredth.
         floored: steps that the scheme's floor kept longer than the limits asked for; such a run may be unstable.
         pressure_iterations: of the solver of projections. unconverged: projections that ended without convergence.
