@@ -20,12 +20,9 @@ DEBUG = "TORCHSPH_TRACEBACK"
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code (argparse itself leaves with 2 by `SystemExit`)."""
-    from torchsph.simulator.schemes.presets import PRESETS
+    from .program import build_parser
 
-    from .arguments import build_parser
-    from .commands import COMMANDS
-
-    args = build_parser(COMMANDS, tuple(PRESETS)).parse_args(arguments)
+    args = build_parser().parse_args(arguments)
     try:
         args.run(args)
         sys.stdout.flush()

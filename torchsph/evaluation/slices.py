@@ -9,7 +9,7 @@ import trimesh
 
 import geometry
 
-from .metrics import sample_inside
+from .boundary_flow import sample_inside
 
 __all__ = ["Cut", "Plane", "cut", "valve_plane"]
 
