@@ -70,8 +70,9 @@ class PolySeries:
         root.attrs["Version"] = np.array([2, 0], np.int64)
         root.attrs.create("Type", np.bytes_("PolyData"))
         self._root, self._steps = root, root.create_group("Steps")
-        self._count = self._points = 0
-        self._topology: tuple[str, np.ndarray] | None = None
+        self._count = self._parts = self._nodes = 0
+        self._cells: np.ndarray | None = None
+        self._starts: dict[str, list[int]] = {}
 
     def __enter__(self) -> PolySeries:
         return self
@@ -104,30 +105,39 @@ class PolySeries:
         place = np.zeros((len(points), 3))
         place[:, : points.shape[1]] = points
         cells = np.arange(len(points))[:, None] if cells is None else np.asarray(cells)
-        kind = {1: "Vertices", 2: "Lines", 3: "Polygons"}[cells.shape[1]]
-        starts = {name: self._length(f"{name}/Connectivity") for name in TOPOLOGIES}
-        cell_starts = {name: self._length(f"{name}/Offsets") - self._count for name in TOPOLOGIES}
+        if self._cells is None or not (len(points) == self._nodes and np.array_equal(cells, self._cells)):
+            self._new_part(cells, len(points))
         _grow(self._steps, "Values", np.array([time]))
-        _grow(self._steps, "PartOffsets", np.array([self._count], np.int64))
+        _grow(self._steps, "PartOffsets", np.array([self._parts - 1], np.int64))
         _grow(self._steps, "NumberOfParts", np.array([1], np.int64))
-        _grow(self._steps, "PointOffsets", np.array([self._points], np.int64))
-        _grow(self._steps, "CellOffsets", np.array([[cell_starts[name] for name in TOPOLOGIES]], np.int64))
-        _grow(self._steps, "ConnectivityIdOffsets", np.array([[starts[name] for name in TOPOLOGIES]], np.int64))
-        _grow(self._root, "NumberOfPoints", np.array([len(points)], np.int64))
+        _grow(self._steps, "PointOffsets", np.array([self._length("Points")], np.int64))
+        for name in ("CellOffsets", "ConnectivityIdOffsets"):
+            _grow(self._steps, name, np.array([self._starts[name]], np.int64))
         _grow(self._root, "Points", place)
-        for name in TOPOLOGIES:
-            chosen = cells if name == kind else cells[:0]
-            _grow(self._root, f"{name}/NumberOfCells", np.array([len(chosen)], np.int64))
-            _grow(self._root, f"{name}/NumberOfConnectivityIds", np.array([chosen.size], np.int64))
-            _grow(self._root, f"{name}/Offsets", cells.shape[1] * np.arange(len(chosen) + 1, dtype=np.int64))
-            _grow(self._root, f"{name}/Connectivity", chosen.ravel().astype(np.int64))
         for group, data in (("PointData", point_data), ("CellData", cell_data)):
             for name, values in (data or {}).items():
                 values = _three(np.asarray(values))
                 _grow(self._steps, f"{group}Offsets/{name}", np.array([self._length(f"{group}/{name}")], np.int64))
                 _grow(self._root, f"{group}/{name}", values)
         self._count += 1
-        self._points += len(points)
+
+    def _new_part(self, cells: np.ndarray, nodes: int) -> None:
+        """Store cells that differ from those of the time before; times of the same cells share them."""
+        kind = {1: "Vertices", 2: "Lines", 3: "Polygons"}[cells.shape[1]]
+        # A part has one offset more than cells, which the reader adds by itself.
+        self._starts = {
+            "CellOffsets": [self._length(f"{name}/Offsets") - self._parts for name in TOPOLOGIES],
+            "ConnectivityIdOffsets": [self._length(f"{name}/Connectivity") for name in TOPOLOGIES],
+        }
+        _grow(self._root, "NumberOfPoints", np.array([nodes], np.int64))
+        for name in TOPOLOGIES:
+            chosen = cells if name == kind else cells[:0]
+            _grow(self._root, f"{name}/NumberOfCells", np.array([len(chosen)], np.int64))
+            _grow(self._root, f"{name}/NumberOfConnectivityIds", np.array([chosen.size], np.int64))
+            _grow(self._root, f"{name}/Offsets", cells.shape[1] * np.arange(len(chosen) + 1, dtype=np.int64))
+            _grow(self._root, f"{name}/Connectivity", chosen.ravel().astype(np.int64))
+        self._cells, self._nodes = cells.copy(), nodes
+        self._parts += 1
 
     def _length(self, name: str) -> int:
         return len(self._root[name]) if name in self._root else 0
@@ -143,7 +153,8 @@ def _three(values: np.ndarray) -> np.ndarray:
 def _grow(group: h5py.Group, name: str, values: np.ndarray) -> None:
     if name not in group:
         chunk = (max(1, min(len(values) or 1, 65536)), *values.shape[1:])
-        group.create_dataset(name, data=values, maxshape=(None, *values.shape[1:]), chunks=chunk)
+        options = {"compression": "gzip", "shuffle": True} if len(values) > 16 else {}
+        group.create_dataset(name, data=values, maxshape=(None, *values.shape[1:]), chunks=chunk, **options)
         return
     node = group[name]
     node.resize(len(node) + len(values), axis=0)
