@@ -174,6 +174,9 @@ def _image(file: h5py.File, recording: Recording) -> h5py.Group:
 
 
 def _steps(root: h5py.Group, time: np.ndarray, names: list[str]) -> None:
+    if len(time) == 1:
+        root.create_group("FieldData")["TimeValue"] = np.asarray(time, np.float64)
+        return
     steps = root.create_group("Steps")
     steps.attrs["NSteps"] = np.int64(len(time))
     steps["Values"] = np.asarray(time, np.float64)
@@ -185,7 +188,10 @@ def _steps(root: h5py.Group, time: np.ndarray, names: list[str]) -> None:
 def _store(points: h5py.Group, name: str, values: np.ndarray, dimension: int) -> None:
     """One chunk a frame, compressed; VTK wants a plane's arrays without the axis of its single layer."""
     values = values[:, 0] if dimension == 2 else values
-    points.create_dataset(name, data=values, chunks=(1, *values.shape[1:]), compression="gzip", shuffle=True)
+    chunk = (1, *values.shape[1:])
+    if len(values) == 1:  # a single time has no axis of times in VTK's eyes
+        values, chunk = values[0], values.shape[1:]
+    points.create_dataset(name, data=values, chunks=chunk, compression="gzip", shuffle=True)
 
 
 def _virtual(points: h5py.Group, name: str, node: h5py.Dataset, recording: Recording, file: str) -> None:
@@ -194,6 +200,15 @@ def _virtual(points: h5py.Group, name: str, node: h5py.Dataset, recording: Recor
     source = h5py.VirtualSource(file, f"/{name}", shape=node.shape, dtype=node.dtype)
     still = node.ndim == recording.dimension + is_vector
     layout = h5py.VirtualLayout((*shape, 3) if is_vector else shape, node.dtype)
+    if recording.frames == 1:  # a single time has no axis of times in VTK's eyes
+        layout = h5py.VirtualLayout(layout.shape[1:], node.dtype)
+        whole = () if still else (0,)
+        if not is_vector:
+            layout[...] = source[(*whole, ...)]
+        for component in range(recording.dimension if is_vector else 0):
+            layout[..., component] = source[(*whole, component)]
+        points.create_virtual_dataset(name, layout, fillvalue=0)
+        return
     for frame in range(recording.frames) if still else [slice(None)]:
         if not is_vector:
             layout[frame] = source if still else source[...]
