@@ -100,7 +100,8 @@ class PolySeries:
             time: s.
             points: (n, D), m.
             cells: (m, 3) triangles or (m, 2) lines of point numbers; None makes a vertex of every point.
-            point_data, cell_data: by name, (n, ...) and (m, ...); the same names at every time.
+            point_data: by name, (n, ...); the same names at every time.
+            cell_data: by name, (m, ...); the same names at every time.
         """
         place = np.zeros((len(points), 3))
         place[:, : points.shape[1]] = points
