@@ -229,9 +229,8 @@ def info(args: argparse.Namespace) -> None:
 
 def summary_table(recording: geometry.Recording) -> list[list[str]]:
     """What a recording holds, as rows of name and value."""
-    time, grid, wall = np.asarray(recording.time), recording.grid, recording.wall
+    time, grid = np.asarray(recording.time), recording.grid
     speed = np.linalg.norm(metrics.filled_velocity(recording), axis=1)[np.asarray(recording.mask, bool)]
-    regions = {int(label): int(n) for label, n in zip(*np.unique(wall.region, return_counts=True), strict=True)}
     intervals = recording.valve_intervals_or_derived()
     optional = ("weight", "sigma", "uncovered", "beam", "pressure", "volume", "flux_mitral", "flux_aortic")
     present = [name for name in optional if getattr(recording, name) is not None]
@@ -244,7 +243,7 @@ def summary_table(recording: geometry.Recording) -> list[list[str]]:
         ["fluid", f"{recording.rho:g} kg/m3, {1e3 * recording.mu:g} mPa s"],
         ["mask", f"{len(speed) / len(time):.0f} nodes in the blood per frame"],
         ["speed", f"RMS {_rms(speed):.3g}, highest {speed.max(initial=0):.3g} m/s"],
-        ["wall", f"{wall.vertices.shape[-2]} vertices, faces by region {regions}"],
+        ["wall", _wall_text(recording.wall)],
         ["also holds", ", ".join(present) or "-"],
     ]
     for region, opening, closing in [] if intervals is None else intervals:
@@ -253,6 +252,13 @@ def summary_table(recording: geometry.Recording) -> list[list[str]]:
 
 
 # --- helpers ---------------------------------------------------------------------------------------
+
+
+def _wall_text(wall: geometry.Wall | None) -> str:
+    if wall is None:
+        return "-"
+    regions = {int(label): int(n) for label, n in zip(*np.unique(wall.region, return_counts=True), strict=True)}
+    return f"{wall.vertices.shape[-2]} vertices, faces by region {regions}"
 
 
 def _mm(lengths: Sequence[float]) -> str:
@@ -286,7 +292,7 @@ def _device(name: str) -> str:
 
 def _check_spacing(spacing: float | None, recording: geometry.Recording) -> None:
     """A spacing in millimetres is the likeliest slip: it leaves no room for a particle."""
-    vertices = recording.wall.at(0).vertices
+    vertices = recording.wall_for("--spacing").at(0).vertices
     narrowest = float(np.ptp(vertices, axis=0).min())
     if spacing is not None and spacing > narrowest / 3:
         raise ValueError(

@@ -87,8 +87,9 @@ def evaluate(
         mask = np.asarray(reference.mask, bool)
         scores |= velocity_scores(velocity, np.asarray(reference.velocity), mask)
     scores["divergence_rms"] = divergence_rms(velocity, mask, recording.grid.spacing)
-    scores["wall_normal_rms"] = wall_normal_rms(velocity, mask, reference)
-    scores["flow_rate_error"] = flow_rate_error(velocity, mask, reference)
+    if reference.wall is not None:
+        scores["wall_normal_rms"] = wall_normal_rms(velocity, mask, reference)
+        scores["flow_rate_error"] = flow_rate_error(velocity, mask, reference)
     if measured is not None:
         scores["residual_rms"] = residual_rms(velocity, _on_frames_of(measured, recording, "the measurement"))
     return scores
@@ -233,9 +234,9 @@ def flow_rate_error(velocity: np.ndarray, mask: np.ndarray, recording: geometry.
 
 
 def _faces(velocity: np.ndarray, mask: np.ndarray, recording: geometry.Recording) -> Iterator[_Faces]:
-    motion = geometry.WallMotion.from_recording(recording)
+    motion, wall = geometry.WallMotion.from_recording(recording), recording.wall_for("metrics of the wall")
     for frame, time in enumerate(recording.time):
-        surface = recording.wall.at(frame)
+        surface = wall.at(frame)
         wall_velocity = np.asarray(motion.velocity(float(time)), np.float64)[surface.faces].mean(1)
         fluid, covered = sample_inside(recording.grid, velocity[frame], mask[frame], surface.centroids)
         yield _Faces(

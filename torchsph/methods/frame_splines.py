@@ -15,7 +15,7 @@ import geometry
 import regularize
 
 from .runtime.parallel import shared
-from .wall_rows import wall_rows
+from .wall_rows import at_knots, wall_rows
 
 # noise and smoothness are chosen in every third frame and serve its neighbours: flow and noise change over tens of
 # milliseconds, and a choice costs four times a fit
@@ -50,8 +50,15 @@ class FrameSmoother:
             raise ValueError(f"choose_every must be at least 1, got {choose_every}")
         if recording.beam is not None and smoother.automatic:
             smoother = smoother.fixed()  # there is no automatic choice from one component along a beam
+        if smoother.spacing is None:
+            smoother = replace(smoother, spacing=recording.grid.spacing)
+        self.motion: geometry.WallMotion | None = None
+        self._sampler: geometry.WallSampler | None = None
+        if recording.wall is not None:
+            self.motion = geometry.WallMotion.from_recording(recording)
+            if smoother.nodes is None:
+                self.motion, self._sampler = at_knots(self.motion, max(smoother.knots_at(recording.grid.spacing)))
         self.recording, self.smoother, self.choose_every = recording, smoother, choose_every
-        self.motion = geometry.WallMotion.from_recording(recording)
         self.nodes = recording.grid.nodes()
         self._choices: dict[int, regularize.Choice | None] = {}
 
@@ -96,7 +103,7 @@ class FrameSmoother:
             points.double(),
             samples.double(),
             weight.double(),
-            self._resting(frame),
+            self._walls(frame, at_rest=True),
             divergence_points=self._inside(frame),
             choice=choice,
             judged=0,
@@ -120,7 +127,7 @@ class FrameSmoother:
             points.double(),
             samples.double(),
             weight.double(),
-            self._resting(frame),
+            self._walls(frame, at_rest=True),
             divergence_points=self._inside(frame),
             beam=beam,
         )
@@ -130,8 +137,11 @@ class FrameSmoother:
         # a forecast's errors reach as far as those that samples share: the ones would be taken for the others
         return replace(self.smoother, correlated=False)
 
-    def _resting(self, frame: int) -> regularize.WallRows:
-        return wall_rows(self.recording, self.motion, frame, at_rest=True)
+    def _walls(self, frame: int, *, at_rest: bool = False) -> regularize.WallRows | None:
+        """Rows of the walls at a frame; None where the recording has no wall."""
+        if self.motion is None:
+            return None
+        return wall_rows(self.recording, self.motion, frame, at_rest=at_rest, sampler=self._sampler)
 
     def _inside(self, frame: int) -> Tensor:
         """(n, D) nodes in the mask of a frame."""
@@ -153,7 +163,7 @@ class FrameSmoother:
             self.nodes[used],
             samples[used],
             weight[used],
-            wall_rows(recording, self.motion, frame),
+            self._walls(frame),
             divergence_points=self.nodes[mask],
             beam=self._beam(frame, used),
             uncertainty=uncertainty,
