@@ -35,7 +35,7 @@ def usable_device(name: str) -> str:
 
 def check_spacing(spacing: float | None, recording: geometry.Recording) -> None:
     """A spacing in millimetres is the likeliest slip: it leaves no room for a particle."""
-    vertices = recording.wall.at(0).vertices
+    vertices = recording.wall_for("--spacing").at(0).vertices
     narrowest = float(np.ptp(vertices, axis=0).min())
     if spacing is not None and spacing > narrowest / 3:
         raise ValueError(

@@ -47,9 +47,9 @@ def flow_rate_error(velocity: np.ndarray, mask: np.ndarray, recording: geometry.
 
 
 def _faces(velocity: np.ndarray, mask: np.ndarray, recording: geometry.Recording) -> Iterator[_Faces]:
-    motion = geometry.WallMotion.from_recording(recording)
+    motion, wall = geometry.WallMotion.from_recording(recording), recording.wall_for("metrics of the wall")
     for frame, time in enumerate(recording.time):
-        surface = recording.wall.at(frame)
+        surface = wall.at(frame)
         wall_velocity = np.asarray(motion.velocity(float(time)), np.float64)[surface.faces].mean(1)
         fluid, covered = sample_inside(recording.grid, velocity[frame], mask[frame], surface.centroids)
         yield _Faces(

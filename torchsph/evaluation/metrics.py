@@ -74,8 +74,9 @@ def evaluate(
         mask = np.asarray(reference.mask, bool)
         scores |= velocity_scores(velocity, np.asarray(reference.velocity), mask)
     scores["divergence_rms"] = divergence_rms(velocity, mask, recording.grid.spacing)
-    scores["wall_normal_rms"] = wall_normal_rms(velocity, mask, reference)
-    scores["flow_rate_error"] = flow_rate_error(velocity, mask, reference)
+    if reference.wall is not None:
+        scores["wall_normal_rms"] = wall_normal_rms(velocity, mask, reference)
+        scores["flow_rate_error"] = flow_rate_error(velocity, mask, reference)
     if measured is not None:
         scores["residual_rms"] = residual_rms(velocity, on_frames_of(measured, recording, "the measurement"))
     return scores

@@ -1,5 +1,6 @@
 """The ensemble cycle and what it rests on: perturbations, the error model, determinism, a gain over the raw data."""
 
+import dataclasses
 from dataclasses import replace
 
 import numpy as np
@@ -14,7 +15,7 @@ from torchsph.data import sample_measurement, sample_truth
 from torchsph.methods.ensemble.model_error import flow_perturbations
 from torchsph.methods.measurement.error_model import kernel_width
 from torchsph.methods.measurement.frame_splines import FrameSmoother, node_weights, smooth_frames
-from torchsph.methods.measurement.wall_rows import flux_shares, open_regions, wall_rows
+from torchsph.methods.measurement.wall_rows import open_regions, wall_rows
 from torchsph.simulator.scene import Scene
 
 
@@ -92,10 +93,16 @@ def test_wall_rows_carry_the_flux_of_the_open_valve(measured):
     assert float(wall_rows(measured, motion, 1, at_rest=True).velocity.abs().max()) == 0.0
 
 
-def test_flux_fills_through_the_first_and_empties_through_the_last_valve():
-    assert flux_shares((1, 2), 3.0) == {1: 3.0, 2: 0.0}
-    assert flux_shares((1, 2), -3.0) == {1: 0.0, 2: -3.0}
-    assert flux_shares((), 3.0) == {}
+def test_openings_that_are_open_together_have_no_rows_and_the_shut_wall_keeps_all(measured):
+    """How they share dV/dt is for the data to say."""
+    both = dataclasses.replace(measured, valve_intervals=np.array([[1.0, -1.0, 9.0], [2.0, -1.0, 9.0]]))
+    motion = geometry.WallMotion.from_recording(both)
+    rows = wall_rows(both, motion, 1)
+    assert open_regions(both, float(both.time[1])) == (1, 2)
+    surface = motion.surface(float(both.time[1]))
+    assert bool(rows.no_slip.all()) and float(rows.weight.sum()) == pytest.approx(
+        float(surface.areas[surface.region == 0].sum())
+    )
 
 
 def test_error_model_finds_white_noise(measured, smoothed):

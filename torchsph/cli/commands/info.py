@@ -44,9 +44,8 @@ def info(args: argparse.Namespace) -> None:
 
 def summary_table(recording: geometry.Recording) -> list[list[str]]:
     """What a recording holds, as rows of name and value."""
-    time, grid, wall = np.asarray(recording.time), recording.grid, recording.wall
+    time, grid = np.asarray(recording.time), recording.grid
     speed = np.linalg.norm(metrics.filled_velocity(recording), axis=1)[np.asarray(recording.mask, bool)]
-    regions = {int(label): int(n) for label, n in zip(*np.unique(wall.region, return_counts=True), strict=True)}
     intervals = recording.valve_intervals_or_derived()
     optional = ("weight", "sigma", "uncovered", "beam", "pressure", "volume", "flux_mitral", "flux_aortic")
     present = [name for name in optional if getattr(recording, name) is not None]
@@ -59,12 +58,19 @@ def summary_table(recording: geometry.Recording) -> list[list[str]]:
         ["fluid", f"{recording.rho:g} kg/m3, {1e3 * recording.mu:g} mPa s"],
         ["mask", f"{len(speed) / len(time):.0f} nodes in the blood per frame"],
         ["speed", f"RMS {_rms(speed):.3g}, highest {speed.max(initial=0):.3g} m/s"],
-        ["wall", f"{wall.vertices.shape[-2]} vertices, faces by region {regions}"],
+        ["wall", _wall_text(recording.wall)],
         ["also holds", ", ".join(present) or "-"],
     ]
     for region, opening, closing in [] if intervals is None else intervals:
         rows.append([f"orifice {int(region)}", f"open {1e3 * opening:g} to {1e3 * closing:g} ms"])
     return rows
+
+
+def _wall_text(wall: geometry.Wall | None) -> str:
+    if wall is None:
+        return "-"
+    regions = {int(label): int(n) for label, n in zip(*np.unique(wall.region, return_counts=True), strict=True)}
+    return f"{wall.vertices.shape[-2]} vertices, faces by region {regions}"
 
 
 def _mm(lengths: Sequence[float]) -> str:

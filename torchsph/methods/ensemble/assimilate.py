@@ -42,7 +42,7 @@ class EnsembleRun:
 
 def default_filter(measured: geometry.Recording, options: EnsembleOptions) -> LETKF:
     """Local ensemble transform Kalman filter with RTPS, its radius from the size of the walls."""
-    vertices = measured.wall.at(0).vertices
+    vertices = measured.wall_for("the ensemble").at(0).vertices
     radius = options.localisation * float(np.ptp(vertices, axis=0).max())
     return LETKF(localisation=Localisation(radius), inflation=RTPS(options.relaxation), gross_error=options.gross_error)
 

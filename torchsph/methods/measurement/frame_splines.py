@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -16,7 +17,7 @@ import regularize
 from regularize.solvers.factor import Factor
 
 from ..runtime.parallel import shared
-from .wall_rows import wall_rows
+from .wall_rows import at_knots, wall_rows
 
 # noise and smoothness are chosen in every third frame and serve its neighbours: flow and noise change over tens of
 # milliseconds, and a choice costs four times a fit
@@ -38,20 +39,40 @@ class FrameSmoother:
         recording: the measurement.
         smoother: options of the fit.
         choose_every: frames that share one choice.
+        estimates: of the recording's walls and valves, where they are there already.
     """
 
     def __init__(
-        self, recording: geometry.Recording, smoother: regularize.Smoother, choose_every: int = CHOICE_EVERY
+        self,
+        recording: geometry.Recording,
+        smoother: regularize.Smoother,
+        choose_every: int = CHOICE_EVERY,
+        *,
+        estimates: geometry.Estimates | None = None,
     ) -> None:
         if choose_every < 1:
             raise ValueError(f"choose_every must be at least 1, got {choose_every}")
+        self.estimates = geometry.estimated(recording) if estimates is None else estimates
+        recording = self.estimates.recording
         self.type = geometry.measurement_type(recording)
         if smoother.automatic and not self.type.full:
             smoother = smoother.fixed()  # there is no automatic choice from components alone
+        if smoother.spacing is None:
+            smoother = replace(smoother, spacing=recording.grid.spacing)
+        self.motion: geometry.WallMotion | None = None
+        self._sampler: geometry.WallSampler | None = None
+        if recording.wall is not None:
+            self.motion = geometry.WallMotion.from_recording(recording)
+            if smoother.nodes is None:
+                self.motion, self._sampler = at_knots(self.motion, max(smoother.knots_at(recording.grid.spacing)))
         self.recording, self.smoother, self.choose_every = recording, smoother, choose_every
-        self.motion = geometry.WallMotion.from_recording(recording)
         self.nodes = recording.grid.nodes()
         self._choices: dict[int, regularize.Choice | None] = {}
+
+    def warn(self) -> None:
+        """Warn of all that walls and valves were believed otherwise than the recording has them."""
+        for text in self.estimates.warnings:
+            warnings.warn(text, stacklevel=3)
 
     def choice(self, frame: int) -> regularize.Choice | None:
         """What was chosen for the middle frame of the frame's group, or the nearest to it that measured anything.
@@ -95,7 +116,7 @@ class FrameSmoother:
             points.double(),
             samples.double(),
             weight.double(),
-            self._resting(frame),
+            self._walls(frame, at_rest=True),
             divergence_points=self._inside(frame),
             choice=choice,
             judged=0,
@@ -119,7 +140,7 @@ class FrameSmoother:
             points.double(),
             samples.double(),
             weight.double(),
-            self._resting(frame),
+            self._walls(frame, at_rest=True),
             divergence_points=self._inside(frame),
             beam=beam,
         )
@@ -129,8 +150,11 @@ class FrameSmoother:
         # a forecast's errors reach as far as those that samples share: the ones would be taken for the others
         return replace(self.smoother, correlated=False)
 
-    def _resting(self, frame: int) -> regularize.WallRows:
-        return wall_rows(self.recording, self.motion, frame, at_rest=True)
+    def _walls(self, frame: int, *, at_rest: bool = False) -> regularize.WallRows | None:
+        """Rows of the walls at a frame; None where the recording has no wall."""
+        if self.motion is None:
+            return None
+        return wall_rows(self.recording, self.motion, frame, at_rest=at_rest, sampler=self._sampler)
 
     def _inside(self, frame: int) -> Tensor:
         """(n, D) nodes in the mask of a frame."""
@@ -154,7 +178,7 @@ class FrameSmoother:
             points,
             rows,
             confidence,
-            wall_rows(recording, self.motion, frame),
+            self._walls(frame),
             divergence_points=self.nodes[mask],
             beam=beam,
             uncertainty=uncertainty,
@@ -235,7 +259,9 @@ def smooth(
     Returns:
         A recording on the measurement's grid, mask and times.
     """
-    return smooth_frames(FrameSmoother(measured, regularize.Smoother() if smoother is None else smoother), progress)
+    frames = FrameSmoother(measured, regularize.Smoother() if smoother is None else smoother)
+    frames.warn()
+    return smooth_frames(frames, progress)
 
 
 def smooth_frames(frames: FrameSmoother, progress: bool = False) -> geometry.Recording:

@@ -19,6 +19,9 @@ class PreparedMeasurement:
     Every method takes one in the place of a recording; methods that share it share the work. Under
     ``torch.distributed`` all processes share the splines of ``smoothed``, so all of them have to ask for it.
 
+    Attributes:
+        recording: the measurement, with walls and valve times as far as they can be believed (``geometry.estimated``).
+
     Args:
         recording: the measurement.
         smoother: options of its splines; None takes the default ones.
@@ -40,11 +43,12 @@ class PreparedMeasurement:
     ) -> None:
         if splines is not None and smoother is not None:
             raise ValueError("PreparedMeasurement takes a smoother or splines, which have one already, not both")
-        self.recording, self.progress = recording, progress
-        self.type = geometry.measurement_type(recording)
+        self.progress = progress
         if splines is None:
             splines = FrameSmoother(recording, regularize.Smoother() if smoother is None else smoother)
-        self.splines = splines
+            splines.warn()
+        self.splines, self.recording = splines, splines.recording
+        self.type = geometry.measurement_type(self.recording)
         if smoothed is not None:
             self.__dict__["smoothed"] = smoothed  # where a cached property keeps what it has found
         if error is not None:
