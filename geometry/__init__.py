@@ -1,6 +1,7 @@
 """Recordings, regular grids, closed surfaces and their signed distance, moving walls, ventricle shapes."""
 
 from .grids.grid import Grid, Stencil
+from .motion.estimates import Estimates, estimated
 from .motion.moving_distance import MovingDistance, WallField, WallPoint
 from .motion.orifices import Orifice, OrificePlane, orifices
 from .motion.refine import refined, refined_motion
@@ -30,6 +31,7 @@ from .ventricle.ventricle import Beat, Ventricle
 __all__ = [
     "Beat",
     "Closest",
+    "Estimates",
     "Finding",
     "Grid",
     "GridDistance",
@@ -59,6 +61,7 @@ __all__ = [
     "ellipse",
     "ellipsoid",
     "estimate_wall",
+    "estimated",
     "find_valve_times",
     "findings",
     "grid_winding",

@@ -13,6 +13,7 @@ from .methods.measurement.frame_splines import smooth
 from .methods.measurement.prepared import PreparedMeasurement
 from .methods.nudging import FilteredRun, filter_sph
 from .pairs.smoothing_kernels import KERNELS, SmoothingKernel, kernel
+from .simulator.failures import NumericalFailure
 from .simulator.grid_forecast import GridForecast, Transfer
 from .simulator.residual_motion import ResidualMotion, residual_motion
 from .simulator.scene import Fluid, Scene, Valve
@@ -24,7 +25,7 @@ from .simulator.schemes.valve_models import PressureSource, Reservoir
 from .simulator.schemes.wall_models import CompleteKernelWall, PotentialWall
 from .simulator.schemes.weakly_compressible import WeaklyCompressible
 from .simulator.seeding import Seeding
-from .simulator.simulation import NumericalFailure, Simulation
+from .simulator.simulation import Simulation
 from .simulator.simulator import Simulator
 
 __version__ = "0.1.0"  # the one place: pyproject.toml reads it from here, without importing

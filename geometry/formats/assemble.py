@@ -141,7 +141,7 @@ def _check_components(source: Source, names: Sequence[str], sizes: list[dict[str
         if {letter: count for letter, count in size.items() if letter != "c"} != first:
             raise FormatError(f"{source.path}: {name} has the shape {size}, but {names[0]} has {sizes[0]}")
     count = sizes[0].get("c", 1) * len(names)
-    if count != dimension:
+    if count != dimension and (dimension, count, len(names)) != (2, 3, 1):  # a plane of vectors in space: its z is left
         raise FormatError(
             f"{source.path}: {dimension} components of velocity are needed, not {count} ({', '.join(names)})"
         )
@@ -151,6 +151,8 @@ def _affine(source: Source, said: FieldMap, counts: tuple[int, ...]) -> np.ndarr
     """From node numbers to places in metres, in LPS where the file is of a patient."""
     dimension = len(counts)
     affine = None if source.affine is None else np.array(source.affine, np.float64)
+    if affine is not None and len(affine) == 4 and dimension == 2:
+        affine = affine[np.ix_([0, 1, 3], [0, 1, 3])]
     unit = said.unit("length") or source.length
     if said.spacing or affine is None:
         spacing = _spacing(source, said, dimension)
@@ -278,12 +280,14 @@ def _scalar(source: Source, said: FieldMap, name: str, lie: Orientation, frames:
 
 def _time(source: Source, said: FieldMap, frames: int) -> np.ndarray:
     unit = said.unit("time") or 1.0
+    time: np.ndarray
     if isinstance(said.time, tuple) and said.time:
         time = np.asarray(said.time, np.float64) * unit
     elif said.time:
-        if said.time not in source.arrays:
-            raise FormatError(f"{source.path}: has no array {said.time} of times")
-        time = np.asarray(source.arrays[said.time][(...,)], np.float64).reshape(-1) * unit
+        name = str(said.time)
+        if name not in source.arrays:
+            raise FormatError(f"{source.path}: has no array {name} of times")
+        time = np.asarray(source.arrays[name][(...,)], np.float64).reshape(-1) * unit
     elif said.interval is not None:
         time = said.interval * np.arange(frames)
     elif source.time is not None:

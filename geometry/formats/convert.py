@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -22,6 +22,8 @@ from .readers.hdf5 import text
 from .registry import open_source
 from .source import FormatError, Source
 from .walls import inside_at, wall_from_files, wall_from_mask
+
+ORDERS = ("zyx", "xyz", "yxz", "zxy", "xzy", "yzx")
 
 
 @dataclass(frozen=True)
@@ -47,6 +49,15 @@ class WallOptions:
         if self.unit:
             return factor(self.unit, "length")
         return said.unit("length") or 1.0
+
+
+@dataclass(frozen=True)
+class _Constants:
+    """kg/m^3, Pa s and s of the recording to be made."""
+
+    rho: float
+    mu: float
+    period: float
 
 
 @dataclass(frozen=True)
@@ -91,7 +102,7 @@ def convert(
     missing = [path for path in (*paths, *map(Path, wall.files)) if not path.exists()]
     if missing:
         raise FileNotFoundError(f"{missing[0]}: there is no such file")
-    about = {"rho": rho, "mu": mu, "period": said.period}
+    about = _Constants(rho, mu, said.period)
     text_of = description or f"converted from {paths[0].name}" + (
         f" and {len(paths) - 1} more" if len(paths) > 1 else ""
     )
@@ -121,7 +132,7 @@ def _fields(paths: Sequence[Path], said: FieldMap, format: str) -> Fields:
             return _ordered(together, said)
         return _joined(
             [
-                _ordered(source, replace(said, interval=None, time=0.0) if _timeless(source) else said)
+                _ordered(source, replace(said, interval=None, time=(0.0,)) if _timeless(source) else said)
                 for source in sources
             ],
             said,
@@ -138,28 +149,28 @@ def _timeless(source: Source) -> bool:
 
 def _ordered(source: Source, said: FieldMap) -> Fields:
     """Assembled; with `axes="auto"` in the order of axes that has the least divergence."""
-    if isinstance(said.time, float):
-        said = replace(said, time=(said.time,))
-    fields = assemble(source, said)
     if said.axes != "auto":
-        return fields
-    bare = Wall(np.eye(4, 3), np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]]), np.zeros(4))
+        return assemble(source, said)
+    # Spacings belong to x, y, z, so that each order is another field: all are tried, and only their scores kept.
+    scores = {axes: _divergence(source, replace(said, axes=axes)) for axes in ORDERS}
+    axes = min(scores, key=lambda one: scores[one])
+    if scores["zyx"] <= FACTOR * scores[axes]:
+        axes = "zyx"
+    fields = assemble(source, replace(said, axes=axes))
+    rest = ", ".join(f"{one} {score:.2g}" for one, score in scores.items() if one != axes)
+    fields.notes.append(f"axes taken as {axes}: divergence {scores[axes]:.2g} of the gradient ({rest})")
+    return fields
+
+
+def _divergence(source: Source, said: FieldMap) -> float:
+    """The RMS of the divergence relative to that of the gradient."""
+    fields = assemble(source, said)
     mask = fields.mask if fields.mask is not None else np.isfinite(fields.velocity).all(axis=1)
-    trial = Recording(fields.time, fields.grid, np.nan_to_num(fields.velocity), mask, bare, 1060.0, 0.0)
-    found = best_order(trial)
+    bare = Wall(np.eye(4, 3), np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]]), np.zeros(4))
+    found = best_order(Recording(fields.time, fields.grid, np.nan_to_num(fields.velocity), mask, bare, 1060.0, 0.0))
     if found is None:
         raise FormatError(f"{source.path}: too little is measured to find the order of axes; say it (--axes zyx)")
-    order, claimed, best = found
-    if claimed <= FACTOR * best or "-" in order:
-        fields.notes.append(
-            f"axes taken as zyx: divergence {claimed:.2g} of the gradient, in the best order {best:.2g}"
-        )
-        return fields
-    renamed = dict(zip(order.split(","), "xyz", strict=True))
-    axes = "".join(renamed[letter] for letter in "zyx")
-    fields = assemble(source, replace(said, axes=axes))
-    fields.notes.append(f"axes taken as {axes}: divergence {best:.2g} of the gradient, as zyx {claimed:.2g}")
-    return fields
+    return found[1]
 
 
 def _merged(sources: Sequence[Source], said: FieldMap) -> Source | None:
@@ -218,13 +229,16 @@ def _joined(parts: Sequence[Fields], said: FieldMap, names: Sequence[str]) -> Fi
             raise FormatError(f"{names[0]}: when were the {len(time)} frames? Say it (--interval S or --period S)")
         time = said.period * np.arange(len(time)) / len(time)
     return replace(
-        first, time=time, velocity=row("velocity"), mask=row("mask"), weight=row("weight"), sigma=row("sigma")
+        first,
+        time=time,
+        velocity=np.concatenate([part.velocity for part in parts]),
+        mask=row("mask"),
+        weight=row("weight"),
+        sigma=row("sigma"),
     )
 
 
-def _walled(
-    fields: Fields, said: FieldMap, options: WallOptions, about: Mapping[str, float], description: str
-) -> Converted:
+def _walled(fields: Fields, said: FieldMap, options: WallOptions, about: _Constants, description: str) -> Converted:
     """A recording of the fields between a wall from files, or one around the mask."""
     notes, grid, velocity, mask = list(fields.notes), fields.grid, fields.velocity, fields.mask
     known = np.isfinite(velocity).all(axis=1)
@@ -266,13 +280,15 @@ def _walled(
         description=description + "".join(f"; {note}" for note in fields.notes),
         weight=weight,
         sigma=fields.sigma,
-        **about,
+        rho=about.rho,
+        mu=about.mu,
+        period=about.period,
     )
     return Converted(recording, tuple(notes))
 
 
 def _walls_alone(
-    paths: Sequence[Path], said: FieldMap, options: WallOptions, about: Mapping[str, float], description: str
+    paths: Sequence[Path], said: FieldMap, options: WallOptions, about: _Constants, description: str
 ) -> Converted:
     """A recording of a wall in which nothing was measured: velocity 0 at weight 0."""
     if said.grid_spacing is None:
@@ -297,7 +313,9 @@ def _walls_alone(
         wall,
         description=f"{description}; walls alone, nothing measured",
         weight=np.zeros(mask.shape),
-        **about,
+        rho=about.rho,
+        mu=about.mu,
+        period=about.period,
     )
     volume = [wall.at(frame).volume for frame in range(count)] if wall.moves else [wall.at(0).volume]
     return Converted(recording, (f"walls alone, {1e6 * min(volume):.4g} to {1e6 * max(volume):.4g} ml; weight 0",))

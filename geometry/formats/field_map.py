@@ -27,8 +27,8 @@ class FieldMap:
         weight: array of confidences from 0 to 1.
         sigma: names of arrays of standard deviations, as `velocity`, in its unit.
         time: array of times, or the times themselves.
-        axes: meaning of the axes in array order, as `zyx`, `txyz` or `tczyx`; `auto` takes the order of least
-            divergence.
+        axes: meaning of the axes in array order, as `zyx`, `txyz` or `tczyx`; `auto` tries all orders and
+            takes that of least divergence.
         components: what the stored components are, as `x,y,z` or `-y,x,z`.
         image_components: whether components run along the image's own axes instead of its coordinates' axes.
         spacing: lengths along x, y, z (one for all), or the array that holds them.
@@ -47,7 +47,7 @@ class FieldMap:
     mask_label: float | None = None
     weight: str = ""
     sigma: tuple[str, ...] = ()
-    time: str | float | tuple[float, ...] = ""
+    time: str | tuple[float, ...] = ""
     axes: str = ""
     components: str = ""
     image_components: bool = False

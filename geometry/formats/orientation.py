@@ -67,7 +67,7 @@ class Orientation:
         axes = [lead + dimension - 1 - self.order[axis] for axis in reversed(range(dimension))]
         turned = np.transpose(values, [*range(lead), *axes])
         flip = [lead + dimension - 1 - axis for axis in range(dimension) if self.sense[axis] < 0]
-        return np.flip(turned, flip) if flip else turned
+        return np.flip(turned, tuple(flip)) if flip else turned
 
     def components(self) -> np.ndarray:
         """(D, D): recorded components from those along the image's own axes i, j, k."""

@@ -66,7 +66,7 @@ def wall_from_mask(mask: np.ndarray, grid: Grid, *, smoothing: int = 0) -> Wall:
         Faces that close a cut get the regions 1, 2, ..., the largest first.
     """
     try:
-        surface = surface_from_mask(mask.any(axis=0), grid, smoothing=smoothing)
+        surface = surface_from_mask(np.asarray(mask.any(axis=0)), grid, smoothing=smoothing)
     except SurfaceError as fault:
         raise FormatError(f"no wall can be made from the mask: {fault}") from fault
     return Wall(surface.vertices, surface.faces, _cuts(surface, grid))

@@ -71,13 +71,14 @@ def find_valve_times(recording: Recording, estimate: WallEstimate | None = None)
 
     Args:
         recording: with walls.
-        estimate: its walls' motion, where that has been estimated already.
+        estimate: its walls' motion, where that has been estimated and applied already.
 
     Raises:
         ValueError: the recording has no wall.
     """
-    estimate = estimate_wall(recording) if estimate is None else estimate
-    recording = estimate.applied(recording)
+    if estimate is None:
+        estimate = estimate_wall(recording)
+        recording = estimate.applied(recording)
     given = recording.valve_intervals_or_derived()
     labels = sorted({int(label) for label in recording.wall.region if label > 0})
     if not labels:
@@ -186,6 +187,8 @@ def _found(recording: Recording, motion: WallMotion, labels: list[int], phases: 
     first, last = _ends(recording)
     rows, errors, changes = [], [], []
     if not phases:
+        if len(labels) == 1:  # a cavity that keeps its volume passes nothing through a single opening
+            return ValveTimes(np.zeros((0, 3)), np.zeros((0, 2)), "given")
         rows = [(label, first, last) for label in labels]
         text = f"the walls keep their volume: openings {labels} are taken for open all the time"
         return ValveTimes(np.array(rows), np.zeros((len(rows), 2)), "found", (text,))

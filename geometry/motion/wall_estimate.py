@@ -103,16 +103,21 @@ def estimate_wall(recording: Recording) -> WallEstimate:
     kept = sizes > 1e-9 * sizes[0] if sizes[0] > 0 else np.zeros(len(sizes), bool)
     if not kept.any():
         return _as_given(recording, wall, time)
-    series = SplineInTime(time, repeats).fit(courses[:, kept] * sizes[kept])
-    shapes = shapes[kept]
-    estimate = _assembled(recording, given, middle, shapes, series)
+    courses = courses[:, kept] * sizes[kept]
+    series = SplineInTime(time, repeats).fit(courses)
+    estimate = _assembled(recording, given, middle, shapes[kept], courses, series)
     return estimate if estimate.relative_jitter > _NIL else _as_given(recording, wall, time)
 
 
 def _assembled(
-    recording: Recording, given: np.ndarray, middle: np.ndarray, shapes: np.ndarray, series: SmoothedSeries
+    recording: Recording,
+    given: np.ndarray,
+    middle: np.ndarray,
+    shapes: np.ndarray,
+    courses: np.ndarray,
+    series: SmoothedSeries,
 ) -> WallEstimate:
-    """The estimate from the modes' shapes (n, nv D) and courses."""
+    """The estimate from the modes' shapes (n, nv D), courses (K, n) as given, and these as estimated."""
     wall, time = recording.wall, np.asarray(recording.time, np.float64)
     vertices = (middle + series.value @ shapes).reshape(given.shape)
     velocity = (series.rate @ shapes).reshape(given.shape)
@@ -121,12 +126,16 @@ def _assembled(
     before, after = (WallMotion.through(time, x, wall.faces, wall.region) for x in (given, vertices))
     swept = np.stack([_swept_by(motion, t, shapes) for t in time])
     width = given[0].size
+    noise = float(np.sqrt((series.noise**2).sum() / width))
+    # a mode's shape is a mean of the frames, weighted by its course: it carries its part of their errors along
+    power = (courses**2).sum(0)
+    of_shapes = noise**2 * (series.value**2 / power).sum(1)
     return WallEstimate(
         time=time,
         vertices=vertices,
         velocity=velocity,
-        noise=float(np.sqrt((series.noise**2).sum() / width)),
-        sigma=np.sqrt(series.value_variance.sum(1) / width),
+        noise=noise,
+        sigma=np.sqrt(series.value_variance.sum(1) / width + of_shapes),
         velocity_sigma=np.sqrt(series.rate_variance.sum(1) / width),
         volume_jitter=_rms([before.volume(t) - after.volume(t) for t in time]),
         rate_jitter=_rms([before.volume_rate(t) - after.volume_rate(t) for t in time]),

@@ -92,7 +92,7 @@ def wrapped_speeds(recording: Recording) -> Iterator[Finding]:
     """Tell of neighbours that differ by nearly twice a common limit: aliased Doppler or phase-contrast speeds."""
     measured = measured_nodes(recording)
     if recording.beam is None:
-        parts = {f"component {'xyz'[c]}": c for c in range(recording.dimension)}
+        parts: dict[str, int | None] = {f"component {'xyz'[c]}": c for c in range(recording.dimension)}
     else:
         parts = {"the speed along the beam": None}
     for name, component in parts.items():

@@ -183,7 +183,7 @@ def _load(node: h5py.Group | h5py.Dataset, dataset: str, kind: type, source: str
 
 
 def _unpacked(node: h5py.Dataset, values: np.ndarray, dataset: str, source: str) -> np.ndarray:
-    """Values in SI units: `scale_factor`, `add_offset`, `_FillValue` (CF conventions, sec. 8.1) and `units` applied."""
+    """Values in SI units: `scale_factor`, `add_offset`, `_FillValue` (CF 1.11, 2023, sec. 8.1) and `units` applied."""
     scale = [_packing(node, name, dataset, source) for name in ("scale_factor", "add_offset", "_FillValue")]
     if scale[0] is None and scale[1] is None:
         if dataset in QUANTITIES and values.dtype.kind in "iu" and values.any():

@@ -1,6 +1,6 @@
 """Surfaces from point clouds, masks and velocity by Delaunay triangulation with an explicit concavity rule.
 
-The thesis (section 3.4) sent the boundary points of a thresholded velocity to qhull, whose simplices together
+Grønli 2017, sec. 3.4 sent the boundary points of a thresholded velocity to qhull, whose simplices together
 fill the convex hull. Which of them are the body is decided here by a rule: for a cloud of points those whose
 circumscribed sphere is no larger than alpha (Edelsbrunner and Muecke 1994, "Three-dimensional alpha shapes"),
 so that concavities wider than 2 alpha appear and an infinite alpha is the convex hull; for a mask those whose
@@ -71,10 +71,10 @@ def surface_from_velocity(
     alpha: float = np.inf,
     smoothing: int = 0,
 ) -> Surface:
-    """The surface around the nodes whose speed exceeds `threshold` (m/s), as in the thesis (section 4.1).
+    """The surface around the nodes whose speed exceeds `threshold` (m/s), as in Grønli 2017, sec. 4.1.
 
     `velocity` (D, *shape) or (T, D, *shape), m/s: with frames, a node counts that exceeds it in any of them.
-    Only for fields that are zero outside the blood: the thesis notes that it does not work in vivo. Further
+    Only for fields that are zero outside the blood: Grønli notes that it does not work in vivo. Further
     as `surface_from_mask`.
     """
     velocity = np.asarray(velocity, np.float64)

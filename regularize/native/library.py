@@ -1,14 +1,14 @@
 """The compiled assembly (csrc/spline.cpp) and band algebra (csrc/band.cpp) behind the calls of the torch reference.
 
-Install builds three shared libraries (see native_build.py); the best one that the processor can run is
-loaded at first use. ``available()`` says whether there is one, ``require()`` why there is none.
+The install builds three shared libraries (see ``build``); the best one that the processor can run is loaded at
+first use. ``available()`` says whether there is one.
 """
 
+from __future__ import annotations
+
 import ctypes
-import os
 from copy import copy
 from functools import lru_cache
-from pathlib import Path
 
 import torch
 
@@ -18,7 +18,9 @@ from regularize.rows.assembly import cell_gram, empty_band
 from regularize.rows.operators import CellRows, DirectionRows, DivergenceRows, RowBlock, System, VectorRows
 from regularize.rows.ordering import Ordering
 
-LEVELS = ("base", "avx2", "avx512")
+from . import build, loader
+
+FAMILY = loader.Family(build.LIBRARIES, build.STEM, "spline_runs", "regularize.native.build")
 KINDS = {VectorRows: 0, DirectionRows: 1, DivergenceRows: 2}
 
 
@@ -51,19 +53,18 @@ class _Rows(ctypes.Structure):
 
 @lru_cache
 def library() -> ctypes.CDLL | None:
-    """The fastest compiled library this processor runs, or None; TORCHSPH_SPLINE_LEVEL names one instead."""
-    folder = Path(__file__).parent
-    portable = folder / "_native_base.so"
-    if not portable.exists():
+    """The library for the best instruction set of this processor; None where nothing was compiled.
+
+    Raises:
+        LibraryMissing: ``TORCHSPH_ISA`` names an instruction set that is unknown or not here, or what was compiled
+            cannot be loaded.
+    """
+    if not FAMILY.path("baseline").is_file():
         return None
-    level = os.environ.get("TORCHSPH_SPLINE_LEVEL")
-    if level is None:
-        level = LEVELS[ctypes.CDLL(str(portable)).spline_cpu_level()]
-    chosen = folder / f"_native_{level}.so"
-    lib = ctypes.CDLL(str(chosen if chosen.exists() else portable))
+    handle = loader.choose(FAMILY).handle
     for name in ("gram", "gradient", "sort", "set_threads", "solve_f64", "solve_f32"):
-        getattr(lib, f"spline_{name}").restype = None
-    return lib
+        getattr(handle, f"spline_{name}").restype = None
+    return handle
 
 
 def available() -> bool:
@@ -124,7 +125,7 @@ class PackedSystem:
         self.sorted: list[torch.Tensor] = []
         self.rows = [self._pack(block) for block in system.blocks]
 
-    def with_weights(self, system: System) -> "PackedSystem":
+    def with_weights(self, system: System) -> PackedSystem:
         """The blocks of ``system``, of which those at the same points need no new sorting."""
         other = copy(self)
         other.system, other._keep = system, [self]  # which holds the memory that stays in use

@@ -79,9 +79,11 @@ def lsqr(
     """Minimise |w * (A x - b)|^2 + damping^2 |x|^2.
 
     ``matvec`` and ``rmatvec`` apply the UNWEIGHTED matrix and its adjoint in whatever precision they are
-    handed (b's for the iteration, float64 for the check); ``weight`` (rows,) multiplies rows as in eqs.
-    3.24 and 3.25. Raises NotConverged, unless ``strict`` is False, when the true relative gradient stays
-    above ``tolerance``.
+    handed (b's for the iteration, float64 for the check); ``weight`` (rows,) multiplies rows as in
+    Grønli 2017, eqs. 3.24 and 3.25.
+
+    Raises:
+        NotConverged: when the true relative gradient stays above ``tolerance``, unless ``strict`` is False.
     """
     limits = Limits(tolerance, max_iterations, strict)
     return iterate("lsqr", _run, matvec, rmatvec, b, weight, damping, limits)

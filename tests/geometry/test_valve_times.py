@@ -23,7 +23,7 @@ def rate_at(time):
 
 
 def box_with_openings(regions, velocity=None, intervals=None, noise=0.0):
-    """A box of 20 mm whose height changes; openings `regions` (quarters of the lid), with `velocity(label, time)` out."""
+    """A box of 20 mm whose height changes; openings `regions` (quarters of the lid), `velocity(label, time)`."""
     box = geometry.box((0, 0, 0), (0.02, 0.02, 0.02), 0.0025)
     fine = np.linspace(0, 0.8, 8001)
     height = 1 + np.concatenate([[0], np.cumsum(0.5 * (rate_at(fine[1:]) + rate_at(fine[:-1])) * np.diff(fine))])
@@ -113,3 +113,18 @@ def test_openings_of_a_rigid_wall_are_always_open():
 def test_a_wall_without_openings_has_no_times():
     found = find_valve_times(box_with_openings(()))
     assert found.intervals.shape == (0, 3) and found.source == "given"
+
+
+def test_a_rigid_cavity_with_one_opening_passes_nothing():
+    recording = box_with_openings((1,))
+    rigid = replace(recording, wall=replace(recording.wall, vertices=recording.wall.vertices[0]))
+    assert len(find_valve_times(rigid).intervals) == 0
+
+
+def test_both_estimates_together():
+    exact = box_with_openings((1, 2), intervals=[(1, 0.44, 0.71), (2, 0.09, 0.36)])
+    found = geometry.estimated(exact)
+    assert found.recording is exact and found.warnings == () and found.summary() == {}
+    flickering = geometry.estimated(box_with_openings((1, 2), noise=0.003))
+    assert len(flickering.warnings) == 3 and "jitters by" in flickering.warnings[0]
+    assert set(flickering.summary()) == {"wall", "valves"}

@@ -30,6 +30,10 @@ def beating(noise=0.0, *, time=TIME, period=0.8, kind="scaling", velocity=False,
     return recording, 3 * size**2 * rate * ball.volume
 
 
+def rms(values):
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
 @pytest.mark.parametrize("velocity", [False, True])
 @pytest.mark.parametrize("period", [0.0, 0.8])
 def test_an_exact_wall_is_returned_as_it_is(velocity, period):
@@ -42,23 +46,27 @@ def test_an_exact_wall_is_returned_as_it_is(velocity, period):
 @pytest.mark.parametrize("kind", ["scaling", "vertices"])
 @pytest.mark.parametrize("period", [0.0, 0.8])
 def test_flicker_is_found_and_most_of_it_taken_out(kind, period):
-    recording, rate = beating(0.5e-3, kind=kind, period=period)
     exact, _ = beating()
-    estimate = estimate_wall(recording)
-    assert estimate.uncertain
-    given = np.sqrt(((recording.wall.vertices - exact.wall.vertices) ** 2).mean())
-    assert estimate.noise == pytest.approx(given, rel=0.25)
-    error = np.sqrt(((estimate.vertices - exact.wall.vertices) ** 2).mean())
-    assert error < 0.7 * given  # a spline with a third of the frames as its freedom leaves .58
-    assert error == pytest.approx(np.sqrt((estimate.sigma**2).mean()), rel=0.5)
-    motion = geometry.WallMotion.from_recording(estimate.applied(recording))
-    found = np.array([motion.volume_rate(t) for t in TIME])
-    flickering = geometry.WallMotion.from_recording(recording)
-    before = np.array([flickering.volume_rate(t) for t in TIME]) - rate
-    assert np.sqrt(((found - rate) ** 2).mean()) < 0.35 * np.sqrt((before**2).mean()) + 0.01 * np.abs(rate).max()
+    given, left, told, rates, before, z = [], [], [], [], [], []
+    for seed in range(6):  # of a scaling there is but one series: one realisation tells little
+        recording, rate = beating(0.5e-3, kind=kind, period=period, seed=seed)
+        estimate = estimate_wall(recording)
+        assert estimate.uncertain
+        given.append(rms(recording.wall.vertices - exact.wall.vertices))
+        assert estimate.noise == pytest.approx(given[-1], rel=0.35)
+        left.append(rms(estimate.vertices - exact.wall.vertices))
+        told.append(rms(estimate.sigma))
+        motion = geometry.WallMotion.from_recording(estimate.applied(recording))
+        rates.append(rms(np.array([motion.volume_rate(t) for t in TIME]) - rate))
+        flickering = geometry.WallMotion.from_recording(recording)
+        before.append(rms(np.array([flickering.volume_rate(t) for t in TIME]) - rate))
+        z.append(rms((estimate.rate - rate) / estimate.rate_sigma))
+    assert rms(left) < 0.65 * rms(given)  # a spline with a third of the frames as its freedom leaves .58
+    assert rms(left) == pytest.approx(rms(told), rel=0.35)
+    # errors of single vertices cancel in the volume; those that all share do not
+    assert rms(rates) < (0.35 if kind == "scaling" else 1.0) * rms(before)
     if kind == "scaling":
-        z = (estimate.rate - rate) / estimate.rate_sigma
-        assert 0.4 < np.sqrt((z**2).mean()) < 2.0
+        assert 0.5 < rms(z) < 1.8
 
 
 def test_velocities_that_hold_no_longer_are_replaced():

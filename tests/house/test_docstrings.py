@@ -161,7 +161,7 @@ def bare_citations(text: str) -> list[str]:
     """Citations whose source is not named: the thesis's numbers alone, or a number without author and year."""
     found = [match[0] for match in BARE.finditer(text)]
     for match in NUMBERED.finditer(text):
-        named = re.search(r"\b(?:1[6-9]|20)\d\d\b", text[max(0, match.start() - 120) : match.start()])
+        named = re.search(r"\b(?:1[6-9]|20)\d\d\b", text[max(0, match.start() - 200) : match.start()])
         if named is None:
             found.append(match[0])
     return found
@@ -225,7 +225,7 @@ def test_what_is_cited_of_the_thesis_stands_in_the_bibliography(package):
     }
     missing = sorted(f"{number} ({place})" for number, place in places.items() if number not in rows)
     assert not missing
-    assert "Grønli, T. (2017)" in bibliography(package)
+    assert "Modeling and data assimilation for improved ultrasound" in bibliography(package)
 
 
 def papers(text: str) -> list[tuple[str, str]]:
@@ -239,7 +239,8 @@ def test_papers_are_read_as_author_and_year():
 
 
 def test_every_paper_that_torchsph_cites_stands_in_its_bibliography():
-    entries = [line for line in bibliography("torchsph").splitlines() if line.startswith("- ")]
+    pages = "\n".join(page.read_text(encoding="utf-8") for page in (ROOT / "torchsph").rglob("*.md"))
+    entries = [line for line in pages.splitlines() if line.startswith("- ")]
     missing = sorted(
         {
             f"{author} {year} ({place})"

@@ -18,7 +18,7 @@ ALLOWED = {
 # What pyproject.toml declares; `triton` comes with torch's CUDA builds and is asked for where it is used.
 THIRD_PARTY = {
     # what the extra `formats` brings is imported where it is used
-    "geometry": {"numpy", "scipy", "trimesh", "h5py", "torch", "vtkmodules", "nibabel", "nrrd", "xarray"},
+    "geometry": {"numpy", "scipy", "trimesh", "h5py", "torch", "vtkmodules", "nibabel", "nrrd", "xarray", "SimpleITK"},
     # triton comes with torch's CUDA builds; pyuff_ustb is the extra `uff`; both are imported where they are used
     "regularize": {"numpy", "scipy", "torch", "triton"},
     "torchsph": {"numpy", "scipy", "trimesh", "h5py", "torch", "tqdm", "matplotlib", "triton", "pyuff_ustb"},

@@ -13,7 +13,16 @@ PAGES = [
     *sorted(page for package in ("geometry", "regularize", "torchsph") for page in (ROOT / package).glob("*.md")),
 ]
 NAMED = re.compile(r"`([\w./-]+\.(?:py|cpp|hpp|h|md|json|toml|png)|[\w.-]+(?:/[\w.-]+)+/?)`")
-MADE = {"metrics.json", "report.png", "filter.png", "checkpoint.pt", "slow_runs.json", "analysis.h5", "terms.hpp"}
+MADE = {  # by commands and by the build
+    "metrics.json",
+    "quantities.json",
+    "report.png",
+    "filter.png",
+    "checkpoint.pt",
+    "analysis.h5",
+    "slow_runs.json",
+    "terms.hpp",
+}
 
 
 def found(name: str, page: Path) -> bool:

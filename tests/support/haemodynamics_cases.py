@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 import geometry
-from torchsph.haemodynamics.derivatives import WallSamples
+from torchsph.haemodynamics.fields.derivatives import WallSamples
 
 
 def ball(spacing: float, radius: float = 1.0) -> tuple[geometry.Grid, np.ndarray, np.ndarray]:

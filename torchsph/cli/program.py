@@ -8,7 +8,7 @@ from torchsph import __version__
 
 from .arguments import Parser
 from .command import Command
-from .commands import assimilate, convert, forecast, info, measure, quantify, smooth
+from .commands import assimilate, convert, export, forecast, info, measure, quantify, smooth
 
 COMMANDS: tuple[Command, ...] = (
     assimilate.COMMAND,
@@ -18,6 +18,7 @@ COMMANDS: tuple[Command, ...] = (
     quantify.COMMAND,
     info.COMMAND,
     convert.COMMAND,
+    export.COMMAND,
 )
 
 

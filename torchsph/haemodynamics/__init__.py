@@ -4,11 +4,12 @@ Pure functions of arrays (velocity, mask, spacing, walls) in SI units; formulas 
 `README.md` here.
 """
 
-from .acceleration import material_acceleration, pressure_gradient, time_derivative
 from .beat import BEAT_UNITS, beat_numbers
 from .circulation import PlaneCirculation, contour_circulation, plane_circulation
-from .derivatives import Derivatives, WallSamples
 from .energy import dissipation, energy_loss, integral, kinetic_energy, kinetic_energy_density
+from .fields.acceleration import material_acceleration, pressure_gradient, time_derivative
+from .fields.derivatives import Derivatives, WallSamples
+from .fields.sampling import PlaneSection, plane_section, sample_in_mask
 from .flow_rate import (
     FillingPeaks,
     OpeningFlow,
@@ -24,7 +25,6 @@ from .lagrangian.moving_flow import MovingFlow, MovingWalls
 from .lagrangian.tracers import Tracers, carry, residence_time, seed_blood
 from .pressure import PressureSolver, pressure_difference, region_mean
 from .quantities import UNITS, FlowDomain, flow_quantities, long_axis
-from .sampling import PlaneSection, plane_section, sample_in_mask
 from .uncertainty import RunningMoments, Summary, around, coverage, summary
 from .vortices import PlaneVortex, VortexRing, main_vortex, vortex_cores, vortex_ring
 from .vorticity import helicity_density, lambda2, q_criterion, vorticity

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 import geometry
 
-from .sampling import PlaneSection, sample_in_mask
+from .fields.sampling import PlaneSection, sample_in_mask
 
 __all__ = ["PlaneCirculation", "contour_circulation", "plane_circulation"]
 

@@ -13,7 +13,7 @@ volume that the wall encloses, where it is known: the mask's own differs from it
 **Means hide energy.** The velocity of an analysis is the mean of what it may be, and a quadratic quantity of a mean is
 too small: E[abs(u)^2] = abs(E[u])^2 + trace of the variance. `kinetic_energy` takes that variance as `sigma`. For the
 dissipation the variance of the *gradient* is wanted. With errors alike in all directions, correlated as
-exp(-r^2 / (2 L^2)), every derivative of a component has the variance sigma^2 / L^2 (Adler 1981, sec. 2.2);
+exp(-r^2 / (2 L^2)), every derivative of a component has the variance sigma^2 / L^2 (Adler 1981);
 `dissipation` takes `sigma` together with that `correlation_length` L. Members need neither: compute on every member.
 """
 

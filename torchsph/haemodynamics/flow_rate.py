@@ -28,8 +28,8 @@ from numpy.typing import ArrayLike, NDArray
 
 import geometry
 
-from .polynomial_fit import derivative_coefficients
-from .sampling import PlaneSection
+from .fields.polynomial_fit import derivative_coefficients
+from .fields.sampling import PlaneSection
 
 __all__ = [
     "FillingPeaks",

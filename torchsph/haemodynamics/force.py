@@ -2,7 +2,7 @@
 
     F = rho integral of (du/dt + u . grad u) dV                                       [N]
 
-(Domenichini & Pedrizzetti 2016, eq. 1; its opposite is what blood exerts on the walls and through the orifices). By the
+(Domenichini & Pedrizzetti 2016; its opposite is what blood exerts on the walls and through the orifices). By the
 transport theorem the same is d/dt of the momentum in the moving volume plus what leaves through the orifices.
 `axial_components` gives the part along the long axis, positive from apex to base, and the size of the rest.
 """

@@ -14,9 +14,9 @@ from numpy.typing import ArrayLike, NDArray
 
 import geometry
 
-from .acceleration import material_acceleration, pressure_gradient, time_derivative
-from .derivatives import Derivatives, WallSamples
 from .energy import energy_loss, integral, kinetic_energy
+from .fields.acceleration import material_acceleration, pressure_gradient, time_derivative
+from .fields.derivatives import Derivatives, WallSamples
 from .flow_rate import OpeningFlow
 from .force import axial_components, haemodynamic_force
 from .pressure import PressureSolver, pressure_difference

@@ -5,8 +5,8 @@ is computed on each of them and only then summarised: of the mean field everythi
 
 An ensemble around a control that is not its mean gives control + (x_m - mean): `around`. With few members the 5 and
 95 % quantiles of a sample lie too far inside; `summary` therefore takes those of Student's distribution with the
-sample's mean and deviation, which hold the right share for a normal quantity at any number of members (Wilks 2011, sec.
-5.2): mean +- t(.95, M - 1) s sqrt(1 + 1 / M).
+sample's mean and deviation, which hold the right share for a normal quantity at any number of members (Wilks
+2011): mean +- t(.95, M - 1) s sqrt(1 + 1 / M).
 """
 
 from __future__ import annotations

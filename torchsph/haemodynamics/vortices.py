@@ -1,7 +1,7 @@
 """Vortices in space and in a plane: where they are, how large, how strong.
 
 In space a vortex core is a connected region where lambda2 < -threshold (Jeong & Hussain 1995). A ring, whole or bent
-and broken, is described by what does not depend on its outline (Saffman 1992, sec. 3.2 and 10.1), with r the distance
+and broken, is described by what does not depend on its outline (Saffman 1992), with r the distance
 from its axis e and w the vorticity around that axis:
 
     centre      mean place of the core, weighted with abs(omega)                    [m]
@@ -10,8 +10,8 @@ from its axis e and w the vorticity around that axis:
     radius      sqrt(I / (pi Gamma)), I = 1/2 integral of r w dV                     [m]
 
 In a plane the vortex is the connected region with Q > 0 whose circulation is largest; its numbers are those that echo
-labs use (Hong et al. 2008; HyperDoppler: Fiorencis et al. 2022; definitions as tabulated by Mele et al. 2019 and in the
-review of intraventricular flow, Cardiovasc. Ultrasound 19, 2021, table 2):
+labs use (Hong et al. 2008; HyperDoppler: Fiorencis et al. 2022; definitions as tabulated in a review of
+intraventricular flow by imaging, doi 10.1186/s12947-021-00269-8):
 
     area        of the vortex over the area of the blood in the plane               [1]
     depth       distance of its centre from the base, over the ventricle's length   [1]
@@ -31,7 +31,7 @@ from scipy.ndimage import generate_binary_structure, label
 
 import geometry
 
-from .sampling import PlaneSection
+from .fields.sampling import PlaneSection
 
 __all__ = ["PlaneVortex", "VortexRing", "main_vortex", "vortex_cores", "vortex_ring"]
 

@@ -7,7 +7,7 @@
 | `q_criterion` | Q = (abs(W)^2 - abs(S)^2) / 2, S and W the symmetric and antisymmetric part of G | 1/s^2 |
 | `lambda2` | middle eigenvalue of S^2 + W^2 | 1/s^2 |
 
-Vortices are where Q > 0 (Hunt, Wray & Moin 1988), or lambda2 < 0 (Jeong & Hussain 1995, sec. 4): a local minimum of
+Vortices are where Q > 0 (Hunt, Wray & Moin 1988), or lambda2 < 0 (Jeong & Hussain 1995): a local minimum of
 pressure across two axes. In a plane flow lambda2 = -Q for a divergence of zero.
 
 All take `gradient` `(*batch, D, D, *shape)`, whatever it was computed by, and return fields over `(*batch, *shape)`.

@@ -19,8 +19,8 @@ from numpy.typing import ArrayLike, NDArray
 
 import geometry
 
-from .derivatives import WallSamples
-from .polynomial_fit import derivative_coefficients
+from .fields.derivatives import WallSamples
+from .fields.polynomial_fit import derivative_coefficients
 
 __all__ = ["WallShear"]
 

@@ -17,6 +17,9 @@ from .valves.model import ValveModel, ValveSetting
 from .valves.registry import valve_model
 from .walls.fields import WallFields
 
+# particles that fill less of what encloses them have a free surface
+_LEAST_FILLING = 0.9
+
 
 class Domain:
     """A scene with a scheme, made ready for particles; shared by all runs, which change nothing of it but caches.
@@ -118,6 +121,21 @@ class Domain:
         if self.period is not None:
             return inside / self.period.double().prod()
         return torch.zeros_like(inside)
+
+    def check_filled(self, particles: Particles, time: float, refusal: str) -> None:
+        """Refuse fluid with a free surface.
+
+        Args:
+            particles: the fluid.
+            time: s.
+            refusal: what to say, with ``{filling}`` for the part of what encloses it that the emptiest member fills.
+
+        Raises:
+            ValueError: the particles of a member do not fill their walls, or their box.
+        """
+        filling = float(self.filling(particles, time).min()) if particles.count else 0.0
+        if filling < _LEAST_FILLING:
+            raise ValueError(refusal.format(filling=f"{100 * filling:.0f} %"))
 
     def breaks(self, start: float, stop: float) -> list[float]:
         """The times (s) in (start, stop] at which members meet: key frames, valve events, and ``stop``."""

@@ -23,8 +23,8 @@ from .state.record import Record
 from .surroundings import PresentSurroundings
 from .walls.interface import CompleteWallSample
 
-# particles that fill less of what encloses them have a free surface, beyond which there is nothing to seed
-_LEAST_FILLING = 0.9
+# beyond a free surface there is nothing to seed
+_UNFILLED = "population control needs fluid that fills its walls or its box; it fills {filling}"
 # new particles keep this far (spacings) from walls
 _CLEARANCE = 0.3
 # largest share of its mass that a particle gives away at once
@@ -66,13 +66,14 @@ class Population:
         domain, scheme = surroundings.domain, surroundings.domain.scheme
         if scheme.population is None:
             return None
-        filling = float(domain.filling(particles, time).min()) if particles.count else 0.0
-        if filling < _LEAST_FILLING:
-            raise ValueError(
-                f"population control needs fluid that fills its walls or its box; it fills {100 * filling:.0f} %"
-            )
+        domain.check_filled(particles, time, _UNFILLED)
         support = Support(kernel(scheme.kernel), scheme.smoothing_ratio, domain.scene.dimension)
         return cls(scheme.population, surroundings, support, backend, record)
+
+    def controlled_when_due(self, particles: Particles, active: Tensor) -> tuple[Particles, bool]:
+        """``controlled`` in the members ``active`` (members,) bool whose turn it is."""
+        due = active & (self._record.steps % self.options.every == 0)
+        return self.controlled(particles, due) if bool(due.any()) else (particles, False)
 
     def controlled(self, particles: Particles, due: Tensor) -> tuple[Particles, bool]:
         """Merge and seed in the members where ``due`` (members,) bool; True where that has changed the set."""

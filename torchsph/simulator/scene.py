@@ -212,8 +212,10 @@ class Scene:
         """The fluid, the moving walls and the valves of a recording: only what it has.
 
         ``spacing`` defaults to the smallest grid spacing. The reference speed is 1 m/s, typical of the heart, so that
-        the same scene results from a noisy and from a clean recording.
+        the same scene results from a noisy and from a clean recording. Walls that flicker are estimated, and valve
+        times that the recording lacks or cannot mean (``geometry.estimated``).
         """
+        recording = geometry.estimated(recording).recording
         intervals = recording.valve_intervals_or_derived()
         regions: dict[int, list[tuple[float, float]]] = {}
         span = (float(recording.time[0]), max(float(recording.time[-1]), float(recording.time[0]) + recording.period))

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import torch
 
-from torchsph.pairs import backend as choose_backend
+from torchsph.pairs import choose_backend
 
 from .domain import Domain
 from .scene import Scene

@@ -11,10 +11,10 @@ from geometry import Grid
 from torchsph.pairs.vectors import per_particle
 
 from .domain import Domain
-from .imposing import fill_beyond
 from .state.clock import Clock
 from .state.particles import Particles
 from .state.record import Record
+from .transfer.imposing import fill_beyond
 from .walls.compiled import near_wall
 from .walls.interface import WallSample
 from .walls.look_up import LookUp

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from torchsph.pairs import backend as choose_backend
+from torchsph.pairs import choose_backend
 from torchsph.pairs.interface import Support
 from torchsph.pairs.smoothing_kernels import kernel
 from torchsph.simulator.schemes.weakly_compressible import WeaklyCompressible

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 import geometry
-from torchsph.pairs import backend as choose_backend
+from torchsph.pairs import choose_backend
 from torchsph.pairs.moving_least_squares import fetch_at
 from torchsph.simulator.scene import Fluid, Scene
 from torchsph.simulator.schemes.scheme import Scheme

@@ -25,7 +25,7 @@ class Reversed:
 
     def __getitem__(self, index: tuple) -> np.ndarray:
         if index == (...,):
-            return np.asarray(self.node[()]).T  # type: ignore[index]
+            return np.asarray(self.node[()]).T
         return np.asarray(self.node[tuple(reversed(index))]).T
 
 

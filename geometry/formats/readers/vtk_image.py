@@ -59,10 +59,10 @@ def open_vtkhdf(path: Path) -> Source:
     steps = root.get("Steps")
     time = None if steps is None else np.asarray(steps["Values"][()], np.float64)
     extent = np.asarray(root.attrs["WholeExtent"])
-    axes = {}
+    space, axes = "yx" if extent[4] == extent[5] else "zyx", {}
     for name, node in arrays.items():
         lead = "t" if steps is not None else ""
-        axes[name] = lead + "zyx" + ("c" if node.ndim == len(lead) + 4 else "")
+        axes[name] = lead + space + ("c" if node.ndim == len(lead) + len(space) + 1 else "")
     matrix = np.asarray(root.attrs.get("Direction", np.eye(3)), np.float64).reshape(3, 3)
     affine = np.eye(4)
     affine[:3, :3] = matrix * np.asarray(root.attrs["Spacing"], np.float64)
@@ -72,7 +72,7 @@ def open_vtkhdf(path: Path) -> Source:
 
 def _vector(arrays: dict) -> dict[str, tuple[str, ...]]:
     """A velocity by its name, else the only vectors that there are; a mask by its name."""
-    vectors = [name for name, array in arrays.items() if array.shape[-1:] == (3,) and len(array.shape) > 3]
+    vectors = [name for name, array in arrays.items() if array.shape[-1:] == (3,) and len(array.shape) > 2]
     named = [name for name in vectors if "veloc" in name.lower()] or vectors
     roles = {"velocity": tuple(named)} if len(named) == 1 else {}
     return roles | {name: (name,) for name in ("mask", "weight") if name in arrays}

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from geometry.formats.source import FormatError, Source, missing_extra
 from geometry.recordings.units import factor
+
+if TYPE_CHECKING:
+    import xarray
 
 
 def open_xarray(path: Path) -> Source:
@@ -40,7 +44,7 @@ def open_xarray(path: Path) -> Source:
     )
 
 
-def _letter(dim: str, dataset) -> str:
+def _letter(dim: str, dataset: xarray.Dataset) -> str:
     name = dim.lower()
     axis = str(dataset[dim].attrs.get("axis", "")).lower() if dim in dataset.coords else ""
     if axis in ("t", "x", "y", "z"):
@@ -75,7 +79,7 @@ def _unit(coordinates: list, quantity: str, path: str) -> float | None:
 
 def _roles(variables: dict) -> dict[str, tuple[str, ...]]:
     """Velocities by their names, as xarray users call them."""
-    roles = {name: (name,) for name in ("mask", "weight", "sigma") if name in variables}
+    roles: dict[str, tuple[str, ...]] = {name: (name,) for name in ("mask", "weight", "sigma") if name in variables}
     for names in (("velocity",), ("u", "v", "w"), ("vx", "vy", "vz"), ("u", "v")):
         if all(name in variables for name in names):
             return roles | {"velocity": names}

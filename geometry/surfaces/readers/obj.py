@@ -7,6 +7,7 @@ vertices").
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -55,7 +56,7 @@ def _index(part: str, known: int) -> int:
     return value - 1 if value > 0 else known + value
 
 
-def _joined(lines):
+def _joined(lines: Iterable[str]) -> Iterator[str]:
     """Lines with those that end in a backslash joined to the next; comments cut off."""
     held = ""
     for line in lines:

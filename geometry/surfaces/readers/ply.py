@@ -79,8 +79,8 @@ def _header(data: bytes) -> tuple[list[_Element], str, bytes]:
                     order = ORDERS[name]
                 case ["element", name, count]:
                     elements.append(_Element(name, int(count)))
-                case ["property", "list", count, kind, name]:
-                    elements[-1].properties.append((name, TYPES[kind], TYPES[count]))
+                case ["property", "list", length, kind, name]:
+                    elements[-1].properties.append((name, TYPES[kind], TYPES[length]))
                 case ["property", kind, name]:
                     elements[-1].properties.append((name, TYPES[kind], None))
         except (KeyError, ValueError, IndexError) as fault:
@@ -96,10 +96,10 @@ def _ascii(elements: list[_Element], body: bytes, _: str) -> dict[str, dict[str,
     found: dict[str, dict[str, list]] = {}
     for element in elements:
         columns: dict[str, list] = {name: [] for name, _, _ in element.properties}
-        for _ in range(element.count):
-            for name, kind, count in element.properties:
-                many = 1 if count is None else int(tokens[at]) if at < len(tokens) else 0
-                at += count is not None
+        for _row in range(element.count):
+            for name, kind, length in element.properties:
+                many = 1 if length is None else int(tokens[at]) if at < len(tokens) else 0
+                at += length is not None
                 words = tokens[at : at + many]
                 if len(words) < many or at > len(tokens):
                     raise PolygonError(f"ends within its element {element.name}")
@@ -109,7 +109,7 @@ def _ascii(elements: list[_Element], body: bytes, _: str) -> dict[str, dict[str,
                     values = [number(word) for word in words]
                 except ValueError as fault:
                     raise PolygonError(f"holds a word that is no number ({fault})") from fault
-                columns[name].append(values[0] if count is None else values)
+                columns[name].append(values[0] if length is None else values)
         found[element.name] = columns
     return found
 
@@ -148,7 +148,9 @@ def _regular(element: _Element, body: bytes, at: int, order: str) -> tuple[dict[
     for column, many in enumerate(lengths):
         if element.properties[column][2] is not None and (rows[f"n{column}"] != many).any():
             return None
-    values = {name: rows[f"v{column}"] for column, (name, _, _) in enumerate(element.properties)}
+    values: dict[str, list | np.ndarray] = {
+        name: rows[f"v{column}"] for column, (name, _, _) in enumerate(element.properties)
+    }
     return values, at + dtype.itemsize * element.count
 
 

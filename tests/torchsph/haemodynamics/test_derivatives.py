@@ -7,7 +7,7 @@ import pytest
 from haemodynamics_cases import ball, on_grid, order, sphere_wall
 
 import geometry
-from torchsph.haemodynamics.derivatives import Derivatives, WallSamples
+from torchsph.haemodynamics.fields.derivatives import Derivatives, WallSamples
 
 
 def quadratic(points):

@@ -8,8 +8,8 @@ from haemodynamics_cases import ball, on_grid, order
 from scipy.ndimage import gaussian_filter
 
 import geometry
-from torchsph.haemodynamics.derivatives import Derivatives
 from torchsph.haemodynamics.energy import dissipation, energy_loss, kinetic_energy
+from torchsph.haemodynamics.fields.derivatives import Derivatives
 
 RHO, MU = 1060.0, 0.004
 

@@ -7,6 +7,7 @@ import pytest
 from haemodynamics_cases import ball, hill_vortex, on_grid, order
 
 import geometry
+from torchsph.haemodynamics.fields.sampling import plane_section
 from torchsph.haemodynamics.flow_rate import (
     OpeningFlow,
     e_and_a,
@@ -16,7 +17,6 @@ from torchsph.haemodynamics.flow_rate import (
     regurgitant_volume,
     stroke_volume,
 )
-from torchsph.haemodynamics.sampling import plane_section
 
 
 def smooth_flow(points, time):

@@ -8,13 +8,13 @@ import torch
 from haemodynamics_cases import ball, on_grid, order, sphere_wall
 
 import geometry
-from torchsph.haemodynamics.acceleration import (
+from torchsph.haemodynamics.fields.acceleration import (
     difference_weights,
     material_acceleration,
     pressure_gradient,
     time_derivative,
 )
-from torchsph.haemodynamics.derivatives import Derivatives, WallSamples
+from torchsph.haemodynamics.fields.derivatives import Derivatives, WallSamples
 from torchsph.haemodynamics.force import axial_components, haemodynamic_force
 from torchsph.haemodynamics.pressure import PressureSolver, pressure_difference, region_mean
 from torchsph.validation.exact_wall_flows import womersley

@@ -49,7 +49,7 @@ def test_frames_in_time(in_time, least):
 
 
 def test_a_tracer_stays_on_its_stream_surface_in_hills_vortex():
-    """psi = 3/4 U r^2 (1 - R^2 / a^2) is constant along a path (Batchelor 1967 eq. 7.2.17)."""
+    """psi = 3/4 U r^2 (1 - R^2 / a^2) is constant along a path (Batchelor 1967, sec. 7.2)."""
     errors, spacings = [], [0.2, 0.1, 0.05]
     for spacing in spacings:
         grid, points, mask = ball(spacing)

@@ -8,8 +8,8 @@ from haemodynamics_cases import ball, hill_vortex, hill_vorticity, on_grid, orde
 
 import geometry
 from torchsph.haemodynamics.circulation import contour_circulation, plane_circulation
-from torchsph.haemodynamics.derivatives import Derivatives
-from torchsph.haemodynamics.sampling import PlaneSection, plane_section
+from torchsph.haemodynamics.fields.derivatives import Derivatives
+from torchsph.haemodynamics.fields.sampling import PlaneSection, plane_section
 from torchsph.haemodynamics.vortices import main_vortex, vortex_cores, vortex_ring
 from torchsph.haemodynamics.vorticity import lambda2, vorticity
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from haemodynamics_cases import ball, hill_vortex, hill_vorticity, on_grid, order, sphere_wall
 
-from torchsph.haemodynamics.derivatives import Derivatives
+from torchsph.haemodynamics.fields.derivatives import Derivatives
 from torchsph.haemodynamics.vorticity import helicity_density, lambda2, q_criterion, vorticity
 
 

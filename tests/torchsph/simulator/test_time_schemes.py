@@ -80,7 +80,7 @@ def test_options_that_would_be_ignored_are_refused():
 
 def test_the_softening_of_the_viscous_term_is_compensated():
     """Over a lattice with a wide kernel the term acts on a shear wave as nu k^2 with the share divided out, 0.6 %."""
-    from torchsph.pairs import MomentumTerms, PairState, Support, backend
+    from torchsph.pairs import MomentumTerms, PairState, Support, choose_backend
     from torchsph.pairs.smoothing_kernels import kernel
     from torchsph.simulator.stepping.terms import softened_share
 
@@ -91,7 +91,7 @@ def test_the_softening_of_the_viscous_term_is_compensated():
     velocity = torch.stack([0 * place[:, 0], torch.sin(wave * place[:, 0])], 1)
     ones, label = torch.ones(len(place), dtype=torch.float64), torch.zeros(len(place), dtype=torch.int64)
     support = Support(kernel("wendland_c2"), 2.0, 2)
-    engine = backend("reference")
+    engine = choose_backend("reference")
     period = torch.tensor([96.0, 16.0], dtype=torch.float64)
     pairs = engine.search(place, label, support.radius, period=period)
     state = PairState(place, velocity, ones, 0 * ones, 0 * ones, label)

@@ -75,6 +75,7 @@ def test_a_sliding_lid_sweeps_nothing():
         run = lid_driven_cavity(across, 100.0, scheme=scheme)
         axis = torch.linspace(0.1, across - 0.1, 60)
         points = torch.cartesian_prod(axis, axis)
+        run.surroundings.enter(0.0, 0.0)
         wall = run.surroundings.sample_at(points)
         nearest = (wall.velocity * wall.completeness_gradient).sum(1)
         rates[sliding] = nearest if wall.swept is None else wall.swept

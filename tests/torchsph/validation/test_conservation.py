@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from torchsph import Scene, Simulator, WeaklyCompressible, preset
-from torchsph.pairs import backend
+from torchsph.pairs import choose_backend
 from torchsph.pairs.interface import MomentumTerms, PairState, Support
 from torchsph.pairs.smoothing_kernels import kernel
 from torchsph.simulator.scene import Fluid
@@ -83,7 +83,7 @@ def viscous_power(run):
     """Power per mass of the laminar forces between the particles, by their sums alone."""
     scene, scheme, p = run.simulator.scene, run.simulator.scheme, run.particles
     support = Support(kernel(scheme.kernel), scheme.smoothing_ratio, p.position.shape[1])
-    acting = backend("reference")
+    acting = choose_backend("reference")
     pairs = acting.search(p.position, p.member, support.radius, period=run.domain.period)
     nu = scene.fluid.kinematic_viscosity / run.units.kinematic_viscosity
     state = PairState(p.position, p.velocity, p.mass, p.deviation, torch.zeros_like(p.deviation), p.member)
@@ -121,7 +121,7 @@ def test_only_the_difference_form_is_blind_to_the_level_of_the_pressure(form):
     ones, member = torch.ones_like(position[:, 0]), torch.zeros(len(position), dtype=torch.int64)
     support = Support(kernel("wendland_c2"), 1.3, 2)
     period = torch.full((2,), 12.0, dtype=torch.float64)
-    acting = backend("auto")
+    acting = choose_backend("auto")
     pairs = acting.search(position, member, support.radius, period=period)
     largest = {}
     for level in (-1.0, 1.0):

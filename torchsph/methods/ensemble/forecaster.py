@@ -17,8 +17,8 @@ from torch import Tensor
 
 import geometry
 from torchsph.assimilation import gather_members
+from torchsph.simulator.failures import NumericalFailure
 from torchsph.simulator.grid_forecast import GridForecast, Transfer
-from torchsph.simulator.simulation import NumericalFailure
 from torchsph.simulator.simulator import Simulator
 
 

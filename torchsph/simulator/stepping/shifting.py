@@ -8,8 +8,7 @@ from torch import Tensor
 
 from torchsph.pairs.vectors import per_particle, square_length
 
-from ..schemes.projection import Projection
-from ..schemes.weakly_compressible import WeaklyCompressible
+from ..schemes.scheme import Scheme
 from ..state.particles import Particles
 from .coefficients import Coefficients
 
@@ -38,7 +37,7 @@ class Shifting:
     surface: float | None = None
 
     @classmethod
-    def of(cls, scheme: WeaklyCompressible | Projection, coefficients: Coefficients) -> Shifting | None:
+    def of(cls, scheme: Scheme, coefficients: Coefficients) -> Shifting | None:
         """The shifting of a scheme with the coefficients in use, or None where it is switched off."""
         if coefficients.shifting is None:
             return None

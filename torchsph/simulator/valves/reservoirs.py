@@ -24,15 +24,14 @@ from ..state.record import Record
 from .accounts import note_passed
 from .buffer_flow import AREA_TRUST, mean_near, scaled_profile, volume_of_rows, with_channel_flux
 from .cavity_volume import CavityVolume
-from .flux_split import FluxSplit, fluxes, takers
+from .flux_split import fluxes, takers
 from .model import Pressure, ValveModel, ValveSetting
 from .openings import OpeningPlane, Openings
 from .pressure_reservoirs import PressureReservoirs
+from .shared_flux import MOUTH, SharedFlux
 
 # how far beyond the plane (spacings) an outgoing particle changes to buffer, and an incoming one to fluid
 _HYSTERESIS = 0.25
-# depth inside the orifice (spacings) at which the profile of an imposed field is read
-_MOUTH = 0.5
 # what stands this far (spacings) on both sides of the plane counts in part as being inside: particles come in layers
 _BLEND = 1.5
 
@@ -61,6 +60,7 @@ class Reservoirs(ValveModel):
             setting.device,
             setting.dtype,
         )
+        self._shared = SharedFlux(self.openings, self.volume)
         self.takes_strength = bool(self.openings.given)
 
     def pressure_reservoirs(self, backend: Backend) -> PressureReservoirs | None:
@@ -128,42 +128,12 @@ class Reservoirs(ValveModel):
         return self._run_out if float(through) < 0.0 else 0.0
 
     def split_points(self, clock: Clock) -> Tensor | None:
-        """Points (n, D) just inside openings that share what they pass, where their fluxes are read; None: none do."""
-        free = takers(self.openings, self.openings.active(clock))
-        if len(free) < 2:
-            return None
-        return torch.cat([plane.quadrature() - _MOUTH * plane.normal for _, plane in free])
+        """See ``SharedFlux.points``."""
+        return self._shared.points(clock)
 
     def note_split(self, velocity: Tensor, clock: Clock) -> None:
-        """Read how openings share what they pass off a field (members, n, D) at their ``split_points``."""
-        free = takers(self.openings, self.openings.active(clock))
-        counts = [len(plane.quadrature()) for _, plane in free]
-        read = [
-            -plane.area * ((part - plane.velocity) @ plane.normal).mean(1)
-            for (_, plane), part in zip(free, velocity.split(counts, dim=1), strict=True)
-        ]
-        self._keep_split(torch.stack(read, 1), free, clock)
-
-    def _keep_split(self, read: Tensor, free: list[tuple[int, OpeningPlane]], clock: Clock) -> None:
-        """Keep fluxes (members, n) that were read of some openings, brought to sum to what they pass together."""
-        numbers = tuple(n for n, _ in free)
-        found = fluxes(self.openings, clock, self.volume.rate(clock.of_members(len(read))))
-        total = torch.stack([found[n] for n in numbers]).sum(0)
-        areas = total.new_tensor([plane.area for _, plane in free])
-        clock.flux_split = FluxSplit.balanced(numbers, read, areas, total)
-
-    def _read_buffers(self, particles: Particles, clock: Clock) -> None:
-        """Read how openings share what they pass off the velocities of their buffers, where a run goes on."""
-        free = takers(self.openings, self.openings.active(clock))
-        behind = [(particles.kind == RESERVOIR + n) | (particles.kind == CHANNEL - n) for n, _ in free]
-        if len(free) < 2 or not all(bool(one.any()) for one in behind):
-            return
-        read = []
-        for (_, plane), one in zip(free, behind, strict=True):
-            along = torch.where(one, ((particles.velocity - plane.velocity) * plane.normal).sum(1), 0.0)
-            count = particles.per_member(one.to(along.dtype), "sum").clamp_min(1.0)
-            read.append(-plane.area * particles.per_member(along, "sum") / count)
-        self._keep_split(torch.stack(read, 1), free, clock)
+        """See ``SharedFlux.read_field``."""
+        self._shared.read_field(velocity, clock)
 
     def opened(self, particles: Particles, clock: Clock) -> Particles:
         """Make the buffers of valves that are open and have none, drop those of valves that have shut."""
@@ -173,7 +143,7 @@ class Reservoirs(ValveModel):
             stay = ~torch.isin(particles.kind, kind)
             particles = particles if bool(stay.all()) else particles.select(stay)
         if clock.flux_split is None:
-            self._read_buffers(particles, clock)
+            self._shared.read_buffers(particles, clock)
         for number, plane in self.openings.active(clock):
             has = particles.per_member((particles.kind == RESERVOIR + number).to(torch.int64), "sum") > 0
             empty = torch.nonzero(~has).squeeze(1)
@@ -328,7 +298,7 @@ class Reservoirs(ValveModel):
         points = particles.position
         for number, plane in self.openings.active(clock):
             height = plane.height(points)
-            inward = (-height - _MOUTH)[:, None] * plane.normal
+            inward = (-height - MOUTH)[:, None] * plane.normal
             behind = (particles.kind == RESERVOIR + number) | (particles.kind == CHANNEL - number)
             points = torch.where(behind[:, None], points + inward, points)
         return points

@@ -10,7 +10,8 @@ from scipy.ndimage import distance_transform_edt
 
 from geometry import Grid, Surface
 from geometry.surfaces.closest import SurfaceIndex
-from torchsph.native.library import ClosestArguments, LibraryMissing, library
+from torchsph.native.library import LibraryMissing, library
+from torchsph.native.structures import ClosestArguments
 
 
 def closest_on_grid(grid: Grid, solid: Surface, values: np.ndarray, limit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

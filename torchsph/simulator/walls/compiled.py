@@ -13,7 +13,8 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
-from torchsph.native.library import REALS, LibraryMissing, WallArguments, address, library
+from torchsph.native.library import REALS, LibraryMissing, address, library
+from torchsph.native.structures import WallArguments
 from torchsph.pairs.interface import PRESSURE_FORMS
 from torchsph.pairs.vectors import per_particle
 

@@ -10,7 +10,8 @@ from torch import Tensor
 from torch.nn import functional
 
 from geometry import Grid
-from torchsph.native.library import REALS, LibraryMissing, LookUpArguments, library
+from torchsph.native.library import REALS, LibraryMissing, library
+from torchsph.native.structures import LookUpArguments
 
 
 class LookUp:

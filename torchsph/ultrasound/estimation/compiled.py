@@ -9,47 +9,12 @@ import torch
 from torch import Tensor
 
 from torchsph.native.library import REALS, library
+from torchsph.native.structures import BoxArguments, CorrelationArguments, ImageArguments
 
 from .correlation import KernelShape, Triple, check_apart, triple
 
-_pointer, _int, _long = ctypes.c_void_p, ctypes.c_int32, ctypes.c_int64
-_Triple = _long * 3
-
-
-class _Correlation(ctypes.Structure):
-    """sph_correlation of csrc/interface.h."""
-
-    _fields_ = [
-        ("threads", _int),
-        *((name, _long) for name in ("points", "images", "apart")),
-        *((name, _Triple) for name in ("shape", "half", "search")),
-        *((name, _pointer) for name in ("volume", "corner", "offset", "ramp", "rho")),
-    ]
-
-
-class _Images(ctypes.Structure):
-    """sph_images of csrc/interface.h."""
-
-    _fields_ = [
-        ("threads", _int),
-        ("images", _long),
-        *((name, _Triple) for name in ("shape", "margin")),
-        *((name, _pointer) for name in ("samples", "volume", "power", "turn")),
-    ]
-
-
-class _Boxes(ctypes.Structure):
-    """sph_boxes of csrc/interface.h."""
-
-    _fields_ = [
-        ("threads", _int),
-        *((name, _long) for name in ("points", "parts")),
-        *((name, _Triple) for name in ("shape", "reach")),
-        *((name, _pointer) for name in ("field", "middle", "out")),
-    ]
-
-
-_STRUCTURES = {"correlate": _Correlation, "arrange": _Images, "box_sums": _Boxes}
+_STRUCTURES = {"correlate": CorrelationArguments, "arrange": ImageArguments, "box_sums": BoxArguments}
+_Triple = ctypes.c_int64 * 3
 
 
 def _call(name: str, dtype: torch.dtype, **arguments: object) -> None:

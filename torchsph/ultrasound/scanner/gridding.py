@@ -19,23 +19,9 @@ import torch
 from torch import Tensor
 
 from torchsph.native.library import REALS, LibraryMissing, library
+from torchsph.native.structures import GriddingArguments
 
 CHUNK = 1 << 14  # points spread at a time: their stencils stay in the cache
-
-_pointer, _int, _long, _real = ctypes.c_void_p, ctypes.c_int32, ctypes.c_int64, ctypes.c_double
-
-
-class _Arguments(ctypes.Structure):
-    """sph_gridding of csrc/interface.h."""
-
-    _fields_ = [
-        *((name, _int) for name in ("threads", "dimension", "width")),
-        ("shape_parameter", _real),
-        *((name, _real * 3) for name in ("origin", "spacing")),
-        ("counts", _long * 3),
-        ("points", _long),
-        *((name, _pointer) for name in ("position", "values", "field")),
-    ]
 
 
 @dataclass(frozen=True)
@@ -104,17 +90,17 @@ class Gridding:
         return torch.cat(parts) if parts else flat.new_zeros(0)
 
     def _call(self, function: Callable[..., object], points: Tensor, values: Tensor, field: Tensor) -> None:
-        points, triple, dimension = points.contiguous(), _real * 3, len(self.shape)
+        points, triple, dimension = points.contiguous(), ctypes.c_double * 3, len(self.shape)
         function(
             ctypes.byref(
-                _Arguments(
+                GriddingArguments(
                     threads=torch.get_num_threads(),
                     dimension=dimension,
                     width=self.width,
                     shape_parameter=self.shape_parameter,
                     origin=triple(*self.origin),
                     spacing=triple(*self.spacing),
-                    counts=(_long * 3)(*reversed(self.shape)),
+                    counts=(ctypes.c_int64 * 3)(*reversed(self.shape)),
                     points=len(points),
                     position=points.data_ptr(),
                     values=values.data_ptr(),

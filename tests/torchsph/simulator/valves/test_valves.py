@@ -9,7 +9,7 @@ from paths import SHARED_DATA
 
 import geometry
 from torchsph import PressureSource, Scene, Simulator, WeaklyCompressible, preset
-from torchsph.simulator import simulation
+from torchsph.simulator import advancing
 from torchsph.simulator.state.clock import Clock
 from torchsph.simulator.state.particles import Particles
 
@@ -171,7 +171,7 @@ def test_the_flow_through_a_valve_does_not_feel_how_often_neighbours_are_searche
     mask = torch.from_numpy(np.array(recording.mask[30], bool))
     fields, searches = [], []
     for margin in (0.1, 0.5):
-        monkeypatch.setattr(simulation, "_SEARCH_MARGIN", margin)
+        monkeypatch.setattr(advancing, "_SEARCH_MARGIN", margin)
         run = Simulator(scene, WeaklyCompressible(), dtype=torch.float64).start(0.30, seed=1)
         run.impose(recording.grid, torch.from_numpy(recording.velocity[30].astype(np.float64)), mask)
         run.advance(0.315)

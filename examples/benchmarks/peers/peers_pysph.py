@@ -1,6 +1,6 @@
 """PySPH's side of peers.py: its own two-dimensional dam break, timed without set-up and compilation.
 
-    PYTHON-WITH-PYSPH examples/benchmarks/peers_pysph.py RESULT.json SPACING DURATION SCHEME THREADS
+    PYTHON-WITH-PYSPH examples/benchmarks/peers/peers_pysph.py RESULT.json SPACING DURATION SCHEME THREADS
 
 Scheme, sound speed, kernel, integrator and adaptive steps are those of ``pysph.examples.dam_break_2d``; only the
 particles are placed so that the column is as wide as it says, and nothing is written while the clock runs.

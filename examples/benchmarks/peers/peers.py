@@ -1,6 +1,6 @@
 """The same dam break by PySPH and by torchsph: wall seconds and the surge front's error against two experiments.
 
-    python examples/benchmarks/peers.py --pysph-python PATH [--quick] [--json FILE] [--spacing M] [--threads N]
+    python examples/benchmarks/peers/peers.py --pysph-python PATH [--quick] [--json FILE] [--spacing M] [--threads N]
 
 A column of water 1 m wide and 2 m high collapses in a tank of 4 m until the front has all but crossed it: the same
 fluid particles, the same physical time, the same number of threads. PySPH runs its own example (``dam_break_2d``:
@@ -31,7 +31,7 @@ import tempfile
 import time
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+sys.path.insert(0, str(Path(__file__).resolve().parents[3]))
 
 import numpy as np
 import torch

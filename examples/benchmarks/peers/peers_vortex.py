@@ -1,6 +1,6 @@
 """The Taylor-Green vortex in the plane by PySPH's EDAC and delta-SPH and by torchsph, at equal spacing.
 
-    python examples/benchmarks/peers_vortex.py --pysph-python PATH [--quick] [--json FILE] [--resolution N]
+    python examples/benchmarks/peers/peers_vortex.py --pysph-python PATH [--quick] [--json FILE] [--resolution N]
 
 Re 100, one decay time, from a lattice and from one whose particles are displaced at random by up to a fifth of a
 spacing (torchsph: a tenth to either side). PySPH runs its own example (``taylor_green``, double precision, one thread)
@@ -23,7 +23,7 @@ import tempfile
 import time
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+sys.path.insert(0, str(Path(__file__).resolve().parents[3]))
 
 import torch
 

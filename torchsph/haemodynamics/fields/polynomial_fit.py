@@ -1,4 +1,4 @@
-"""Derivatives at scattered places by moving least squares (Lancaster & Salkauskas 1981, sec. 2).
+"""Derivatives at scattered places by moving least squares (Lancaster & Salkauskas 1981).
 
 Around each place a polynomial is fitted to the samples near it, with Gaussian weights of their distance; its
 derivatives there are linear in the samples, and this file finds the coefficients.
