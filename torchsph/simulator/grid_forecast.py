@@ -79,7 +79,7 @@ class GridForecast:
         """
         self.run.advance(time)
         found = self.run.fetch(self.grid, mask)
-        if self._lost is None:
+        if self._lost is None or self.transfer.fade is None:
             return found.value, found.covered
         share = math.exp(-(time - self.start_time) / self.transfer.fade)
         return found.value + share * self._lost * found.covered[:, None], found.covered
