@@ -30,7 +30,7 @@ class Model(Protocol):
         """What is simulated."""
 
     @property
-    def scheme(self) -> Scheme:
+    def scheme(self) -> Scheme | None:
         """How it is stepped."""
 
     @property

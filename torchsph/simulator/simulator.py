@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 
@@ -36,15 +36,16 @@ class Simulator:
     dtype: torch.dtype = torch.float32
     backend: str = "auto"
     seeding: Seeding | None = None
+    _domain: Domain = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        if self.scheme is None:
-            object.__setattr__(self, "scheme", preset("weakly_compressible"))
+        scheme = preset("weakly_compressible") if self.scheme is None else self.scheme
+        object.__setattr__(self, "scheme", scheme)
         if self.dtype not in (torch.float32, torch.float64):
             raise ValueError(f"Simulator.dtype must be torch.float32 or torch.float64, got {self.dtype}")
         choose_backend(self.backend, self.device)  # a missing backend must not surface in the middle of a run
         units = Units(self.scene.spacing, self.scene.reference_speed)
-        domain = Domain(self.scene, self.scheme, units, self.device, self.dtype)
+        domain = Domain(self.scene, scheme, units, self.device, self.dtype)
         object.__setattr__(self, "_domain", domain)
 
     @property

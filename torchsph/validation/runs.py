@@ -15,8 +15,9 @@ from torchsph.simulator.scene import Fluid, Scene
 from torchsph.simulator.schemes.scheme import Scheme
 from torchsph.simulator.schemes.weakly_compressible import WeaklyCompressible
 from torchsph.simulator.seeding import Seeding
-from torchsph.simulator.simulation import FETCH_RADIUS, Simulation
+from torchsph.simulator.simulation import Simulation
 from torchsph.simulator.simulator import Simulator
+from torchsph.simulator.transfer.fetching import FETCH_RADIUS
 
 from . import exact_flows
 

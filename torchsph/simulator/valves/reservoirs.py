@@ -15,7 +15,6 @@ import torch
 from torch import Tensor
 
 from torchsph.pairs.interface import Backend
-from torchsph.pairs.vectors import per_particle
 
 from ..schemes.valve_models import Reservoir
 from ..state.clock import Clock
@@ -29,11 +28,10 @@ from .model import Pressure, ValveModel, ValveSetting
 from .openings import OpeningPlane, Openings
 from .pressure_reservoirs import PressureReservoirs
 from .shared_flux import MOUTH, SharedFlux
+from .volume_match import levelled, volume_inside
 
 # how far beyond the plane (spacings) an outgoing particle changes to buffer, and an incoming one to fluid
 _HYSTERESIS = 0.25
-# what stands this far (spacings) on both sides of the plane counts in part as being inside: particles come in layers
-_BLEND = 1.5
 
 
 class Reservoirs(ValveModel):
@@ -71,45 +69,18 @@ class Reservoirs(ValveModel):
         s = self._setting
         return PressureReservoirs(self.openings, backend, s.support_radius, unit, s.period, s.device)
 
-    def _deficit(self, particles: Particles, times: Tensor, clock: Clock) -> Tensor:
-        """Volume that the particles inside fall short of the cavity's, (members,), internal.
-
-        A particle in an open orifice counts by the part that is inside, blended in over a spacing at the rim, so that
-        the sum does not jump as it crosses.
-        """
-        part = particles.inside.to(particles.mass.dtype)
-        for _, plane in self.openings.active(clock):
-            height = plane.height(particles.position)
-            row = torch.nonzero(height.abs() < _BLEND).squeeze(1)
-            over = plane.cover(particles.position[row])
-            inner = 0.5 - 0.5 / _BLEND * height[row]
-            part = part.index_put((row,), torch.lerp(part[row], inner * inner * (3.0 - 2.0 * inner), over))
-        # in double: thousands of equal masses added in single precision drift by more than the difference
-        filled = particles.per_member((part * particles.mass).double(), "sum")
-        return (self.volume.volume(times, torch.float64) - filled).to(self._setting.dtype)
-
-    def _levelled(self, particles: Particles, clock: Clock) -> Particles:
-        """Particles whose mean density deviation at the open valves is 0, in compressible schemes.
-
-        Where the speed of all that encloses a fluid is prescribed, the percents by which sums over neighbours miss the
-        volume that is swept add up, to a pressure that is the same everywhere and tells nothing but feeds disorder.
-        """
-        if not self._setting.compressible:
-            return particles
-        near = torch.zeros_like(particles.inside)
-        for _, plane in self.openings.active(clock):
-            near |= (particles.position - plane.centre).square().sum(1) < plane.radius**2
-        weight = torch.where(particles.inside & near, particles.mass, torch.zeros_like(particles.mass))
-        total = particles.per_member(weight, "sum").clamp_min(1.0)
-        mean = particles.per_member(weight * particles.deviation, "sum") / total
-        return particles.changed(deviation=particles.deviation - per_particle(mean, particles.member))
+    def _deficit(self, particles: Particles, clock: Clock) -> Tensor:
+        """Volume that the particles inside fall short of the cavity's, (members,), internal."""
+        filled = volume_inside(particles, [plane for _, plane in self.openings.active(clock)])
+        wanted = self.volume.volume(clock.of_members(particles.members), torch.float64)
+        return (wanted - filled).to(self._setting.dtype)
 
     def volume_deficit_rate(self, particles: Particles, clock: Clock) -> Tensor:
         """Part of the cavity's volume, per time, that should come in for what particles lack, (members,)."""
         times = clock.of_members(particles.members)
         if self.relaxation is None:
             return torch.zeros_like(times, dtype=self._setting.dtype)
-        return self._deficit(particles, times, clock) / (self.volume.volume(times) * self.relaxation)
+        return self._deficit(particles, clock) / (self.volume.volume(times) * self.relaxation)
 
     def _lead(self, number: int, clock: Clock, members: int) -> float | Tensor:
         """Length of the free channel before the buffer of an opening: 0 where fluid enters in the present interval.
@@ -180,8 +151,9 @@ class Reservoirs(ValveModel):
         times = clock.of_members(particles.members)
         inflow, active, given = self.volume.rate(times), self.openings.active(clock), self.openings.given
         if self.relaxation is not None and not channel and not any(number in given for number, _ in active):
-            inflow = inflow + self._deficit(particles, times, clock) / self.relaxation
-            particles = self._levelled(particles, clock)
+            inflow = inflow + self._deficit(particles, clock) / self.relaxation
+            if self._setting.compressible:
+                particles = levelled(particles, [plane for _, plane in active])
         velocity, through = particles.velocity, fluxes(self.openings, clock, inflow)
         for number, plane in active:
             if number in given:
