@@ -12,6 +12,7 @@ from .motion.wall_points import WallPoints, WallSampler, wall_points
 from .recordings.checks import findings
 from .recordings.errors import RecordingError
 from .recordings.finding import Finding
+from .recordings.measurement_types import MeasurementType, measurement_type
 from .recordings.read import read_recording
 from .recordings.recording import Recording, Wall
 from .recordings.rules import check_recording
@@ -34,6 +35,7 @@ __all__ = [
     "Finding",
     "Grid",
     "GridDistance",
+    "MeasurementType",
     "MovingDistance",
     "Opening",
     "Orifice",
@@ -64,6 +66,7 @@ __all__ = [
     "findings",
     "grid_winding",
     "labelled",
+    "measurement_type",
     "openings",
     "orifices",
     "polygon",

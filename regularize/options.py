@@ -13,17 +13,34 @@ over walls by WallRows.weight.
 rows at the samples (BIBLIOGRAPHY.md has our corrections), the meaning that the settings of its table 4.1 need.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Self
+from typing import Any, Final, Literal, Self
 
 from .basis.bspline import DEGREES
+from .basis.sampling import mean_length
 from .errors import InvalidInput
 from .solvers.registry import AUTO, SOLVERS
 from .statistics.likelihood import Choice
 from .statistics.robust import CUTOFFS
 
 SCALINGS = ("density", "thesis")
+BY_DATA: Final = "auto"  # of a length or a time: from the distance between samples
+# Three samples between knots: a kernel of three voxels, the usual one, leaves nothing finer, and noise is averaged. Two
+# where the noise found is less than LOW_NOISE of the flow: then it is mostly what wider knots do not resolve.
+SAMPLES_PER_KNOT, SAMPLES_OF_LOW_NOISE, LOW_NOISE = 3.0, 2.0, 0.2
+DIVERGENCE = 10.0  # knot distances
+CURVATURE = 3.0  # to a knot distance; the first guess of a search
+Length = float | Literal["auto"]
+LENGTHS = ("divergence", "curvature", "time_curvature")  # that a number of knots stands for
 AUTOMATIC = (None, "likelihood", "gcv")
+
+
+def length_of(value: Length | None) -> float:
+    """The number of a length or a time that is set; 0 for None. InvalidInput where the data have still to decide."""
+    if isinstance(value, str):
+        raise InvalidInput("lengths are still to be decided by the data: fill them in by for_knots")
+    return 0.0 if value is None else value
 
 
 @dataclass(frozen=True)
@@ -31,16 +48,22 @@ class SplineOptions:
     """Options of the spline fit; ``None`` switches a part off. See the module's text for the units.
 
     Args:
-        knots: m, knot distance, one number or one per axis.
+        knots: m, knot distance, one number or one per axis; "auto": three times the distance between samples, along
+            each axis of a grid, or twice where an automatic choice finds little noise, and no less than
+            ``resolution``; wider where factoring would take more work than a fixed number of operations per sample.
+        spacing: m, distances between samples along the axes where they are known (of a grid, x first); None: found
+            from the samples.
+        resolution: m, full width at half maximum over which the measurement averages, where it is known to be more
+            than three samples.
         nodes: coefficients per axis instead, longest side first (Grønli 2017, table 4.1: 32, 16, 16).
-        time_knots: s, knot distance along the time, for points with a time column.
+        time_knots: s, knot distance along the time, for points with a time column; "auto": three frames.
         degree: of the splines, 1 to 5.
-        divergence: m, strength of div v = 0.
+        divergence: m, strength of div v = 0; "auto": ten knot distances.
         wall: strength of the walls' normal velocity, a ratio.
         no_slip: strength of the walls' full velocity, a ratio.
-        curvature: m, strength of smoothness.
+        curvature: m, strength of smoothness; "auto": a third of the knot distance.
         time_curvature: s; adds time_curvature^4 <|d^2 v / dt^2|^2> to the cost and keeps its ratio to curvature where
-            that is chosen automatically.
+            that is chosen automatically; "auto": a third of time_knots.
         order: of the derivatives that curvature and time_curvature penalise, at most ``degree``; 3 fills gaps in
             exact, smooth data better.
         damping: of the coefficients, a ratio.
@@ -72,15 +95,17 @@ class SplineOptions:
         InvalidInput: an option out of its range, or options that exclude each other.
     """
 
-    knots: float | tuple[float, ...] | None = 3e-3
+    knots: Length | tuple[float, ...] | None = BY_DATA
+    spacing: tuple[float, ...] | None = None
+    resolution: float | None = None
     nodes: tuple[int, ...] | None = None
-    time_knots: float | None = None
+    time_knots: Length | None = BY_DATA
     degree: int = 3
-    divergence: float | None = 30e-3
+    divergence: Length | None = BY_DATA
     wall: float | None = 2.0
     no_slip: float | None = 0.5
-    curvature: float | None = 1e-3
-    time_curvature: float | None = 10e-3
+    curvature: Length | None = BY_DATA
+    time_curvature: Length | None = BY_DATA
     order: int = 2
     damping: float | None = 1e-5
     power: float = 1.0
@@ -99,13 +124,16 @@ class SplineOptions:
 
     def __post_init__(self) -> None:
         if (self.knots is None) == (self.nodes is None):
-            raise InvalidInput("give exactly one of knots (a distance in m) and nodes (a count per axis)")
+            raise InvalidInput("give exactly one of knots (a distance in m, or 'auto') and nodes (a count per axis)")
         if self.nodes is not None and min(self.nodes) <= self.degree:
             raise InvalidInput(f"nodes is {self.nodes}: each axis needs more than degree = {self.degree}")
         for name in ("divergence", "wall", "no_slip", "curvature", "time_curvature", "damping"):
             value = getattr(self, name)
-            if value is not None and not 0 <= value < float("inf"):
-                raise InvalidInput(f"{name} is {value}: it must be finite and >= 0, or None to switch it off")
+            if value == BY_DATA and name in LENGTHS:
+                continue
+            if value is not None and (isinstance(value, str) or not 0 <= value < float("inf")):
+                raise InvalidInput(f"{name} is {value!r}: it must be finite and >= 0, or None to switch it off")
+        self._check_distances()
         if not 1 <= self.order <= self.degree and self.curvature:
             raise InvalidInput(f"order is {self.order}: it must lie between 1 and degree = {self.degree}")
         if self.power < 0:
@@ -122,6 +150,15 @@ class SplineOptions:
         if self.tolerance <= 0 or self.max_iterations < 1 or self.rounds < 1 or self.search_knots < 1:
             raise InvalidInput("tolerance must be > 0; max_iterations, rounds and search_knots >= 1")
         self._check_combinations()
+
+    def _check_distances(self) -> None:
+        others = (("spacing", self.spacing), ("resolution", self.resolution))
+        for name, value in (("knots", self.knots), ("time_knots", self.time_knots), *others):
+            if value is None or (value == BY_DATA and "knots" in name):
+                continue
+            each = value if isinstance(value, tuple | list) else (value,)
+            if any(isinstance(one, str) or not 0 < one < float("inf") for one in each):
+                raise InvalidInput(f"{name} is {value!r}: it must be a positive distance, in m (time_knots: s)")
 
     def _check_combinations(self) -> None:
         if self.automatic and (self.scaling == "thesis" or not self.curvature):
@@ -167,10 +204,34 @@ class SplineOptions:
         off: dict[str, Any] = {"automatic": None, "robust": None, "choose_divergence": False}
         return replace(self, **off | changes)
 
+    def knots_at(self, steps: Sequence[float], per_knot: float = SAMPLES_PER_KNOT) -> tuple[float, ...]:
+        """Knot distances (D,), m: given, or for samples ``steps`` (D,) m apart, ``per_knot`` of them to a knot."""
+        if self.knots != BY_DATA:
+            given = self.knots if isinstance(self.knots, tuple | list) else (length_of(self.knots),) * len(steps)
+            return tuple(given)
+        return tuple(max(per_knot * step, self.resolution or 0.0) for step in steps)
+
+    def for_knots(self, spacing: Sequence[float], components: int) -> Self:
+        """The same options with numbers for all lengths and times that the data were to decide.
+
+        Args:
+            spacing: A knot distances, m, with that along the time (s) as a last one where there is one.
+            components: D.
+        """
+        length = mean_length(spacing[:components])
+        known: dict[str, Any] = {}
+        if self.divergence == BY_DATA:
+            known["divergence"] = DIVERGENCE * length
+        if self.curvature == BY_DATA:
+            known["curvature"] = length / CURVATURE
+        if self.time_curvature == BY_DATA:
+            known["time_curvature"] = spacing[-1] / CURVATURE if len(spacing) > components else None
+        return replace(self, **known) if known else self
+
     def with_choice(self, choice: Choice) -> Self:
         """The same options, fixed at what was chosen."""
-        in_time = self.time_curvature
-        if in_time is not None and self.curvature:
-            in_time = choice.curvature / self.curvature * in_time
+        curvature, in_time = length_of(self.curvature), self.time_curvature
+        if in_time is not None and curvature:
+            in_time = choice.curvature / curvature * length_of(in_time)
         free = self.divergence if choice.divergence is None else choice.divergence
         return self.fixed(time_curvature=in_time, curvature=choice.curvature, no_slip=choice.no_slip, divergence=free)

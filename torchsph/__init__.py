@@ -7,12 +7,14 @@ and an ensemble filter joins forecasts and measurements.
 from .methods.by_name import DEFAULT_METHOD, METHODS, MethodResult, forecast_skill, make_model, run_methods
 from .methods.ensemble.assimilate import EnsembleRun, assimilate, default_filter
 from .methods.ensemble.options import EnsembleOptions, Estimated
-from .methods.frame_splines import smooth
+from .methods.forecast_skill import ForecastSkill, skill
 from .methods.measurement.error_model import ObservationError, estimate_error
+from .methods.measurement.frame_splines import smooth
+from .methods.measurement.prepared import PreparedMeasurement as PreparedMeasurement
 from .methods.nudging import FilteredRun, filter_sph
 from .pairs.smoothing_kernels import KERNELS, SmoothingKernel, kernel
 from .simulator.failures import NumericalFailure
-from .simulator.grid_forecast import ForecastSkill, GridForecast, Transfer, skill
+from .simulator.grid_forecast import GridForecast, Transfer
 from .simulator.residual_motion import ResidualMotion, residual_motion
 from .simulator.scene import Fluid, Scene, Valve
 from .simulator.schemes.parts import XSPH, GammaRamp, Rollback

@@ -28,11 +28,10 @@ import numpy as np
 import torch
 
 import geometry
-import regularize
 from torchsph import assimilate, make_model
 from torchsph.evaluation.metrics import evaluate, spread_over_skill
-from torchsph.methods.frame_splines import FrameSmoother, smooth_frames
 from torchsph.methods.free_run import run_freely
+from torchsph.methods.measurement.prepared import PreparedMeasurement
 from torchsph.ultrasound import NoiseModel, measure_noise
 
 MEMBERS = 16
@@ -89,14 +88,12 @@ def run(case: Case, truth: geometry.Recording, seed: int) -> dict:
     """One row: the errors of the methods and the seconds of the ensemble."""
     measured = measure_noise(truth, case.noise, seed)
     measured = measured if case.change is None else case.change(measured)
-    splines = FrameSmoother(measured, regularize.Smoother())
-    smoothed = smooth_frames(splines)
+    prepared = PreparedMeasurement(measured)
+    smoothed = prepared.smoothed
     step = min(measured.grid.spacing)
     fine, coarse = make_model(measured, spacing=step), make_model(measured, spacing=2 * step)
     began, worked = time.perf_counter(), time.process_time()
-    ensemble = assimilate(
-        measured, fine, coarse=coarse, members=case.members, splines=splines, smoothed=smoothed, seed=seed
-    )
+    ensemble = assimilate(prepared, fine, coarse=coarse, members=case.members, seed=seed)
     seconds, worked = time.perf_counter() - began, time.process_time() - worked
     found = {
         "spline": smoothed,

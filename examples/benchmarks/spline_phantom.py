@@ -29,8 +29,8 @@ from scipy.ndimage import gaussian_filter
 
 import geometry
 import regularize
-from torchsph.evaluation.metrics import matching_frames
-from torchsph.methods.frame_splines import FrameSmoother, node_weights
+from torchsph.evaluation.frames import matching_frames
+from torchsph.methods.measurement.frame_splines import FrameSmoother, node_weights
 
 WIDTH = 3e-3  # m, full width at half maximum of the Gaussian
 BLUR = 10e-3  # s, standard deviation of the average over time

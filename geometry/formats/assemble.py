@@ -26,7 +26,9 @@ class Fields:
         grid: of all fields.
         time: (T,), s.
         velocity: (T, D, *grid), m/s, float32; NaN where the file has no value.
-        mask, weight: (T, *grid) or None; `sigma` as the velocity, or None.
+        mask: (T, *grid), bool, or None.
+        weight: (T, *grid), 0 to 1, or None.
+        sigma: (T, D, *grid), m/s, or None.
         turn: (D, D), rotation from the recording's coordinates to the file's; walls are turned back by it.
         notes: sentences for the user.
     """

@@ -33,7 +33,9 @@ class FieldMap:
         image_components: whether components run along the image's own axes instead of its coordinates' axes.
         spacing: lengths along x, y, z (one for all), or the array that holds them.
         origin: place of the first node, x, y, z.
-        length_unit, time_unit, velocity_unit: a name (`mm`, `ms`, `cm/s`) or a number of SI units.
+        length_unit: a name (`mm`) or a number of m.
+        time_unit: a name (`ms`) or a number of s.
+        velocity_unit: a name (`cm/s`) or a number of m/s.
         interval: s between frames.
         period: s; frames without times are spread over one period.
         columns: of a text file of scattered tracks, as `id,x,y,z,u,v,w,-,t`.

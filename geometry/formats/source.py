@@ -17,10 +17,14 @@ class ArrayLike(Protocol):
     """An array whose shape is known before its values are read."""
 
     @property
-    def shape(self) -> tuple[int, ...]: ...
+    def shape(self) -> tuple[int, ...]:
+        """Sizes of its axes."""
+        ...
 
     @property
-    def dtype(self) -> np.dtype: ...
+    def dtype(self) -> np.dtype:
+        """Type of its values."""
+        ...
 
     def __getitem__(self, index: tuple) -> np.ndarray: ...
 

@@ -50,7 +50,7 @@ class WallMotion:
 
         With a period that the frames do not fill, the first key frame is repeated a period later.
         """
-        wall, time = recording.wall, recording.time
+        wall, time = recording.wall_for("the motion of the wall"), recording.time
         if not wall.moves or recording.frames == 1:
             return cls.at_rest(wall.at(0))
         vertices, rates = wall.vertices, wall.velocity

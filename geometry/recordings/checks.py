@@ -99,10 +99,10 @@ def _errors(recording: Recording) -> Iterator[Finding]:
 
 
 def _speeds(recording: Recording) -> Iterator[Finding]:
-    velocity = recording.velocity[np.broadcast_to(measured_nodes(recording)[:, None], recording.velocity.shape)]
-    highest = float(np.abs(velocity).max(initial=0))
+    speed = np.sqrt((recording.velocity.astype(np.float64) ** 2).sum(axis=1))[measured_nodes(recording)]
+    highest = float(speed.max(initial=0))
     if highest > FAST:
-        rule = f"reaches {highest:.3g} m/s (RMS {_rms(velocity):.3g}), faster than the jets of narrow valves"
+        rule = f"reaches {highest:.3g} m/s (RMS {_rms(speed):.3g}), faster than the jets of narrow valves"
         yield Finding("/velocity", rule, "if it is in cm/s or mm/s, convert it to m/s; else mark outliers by /weight")
     elif 0 < highest < 1e-3:
         rule = f"stays below {1e3 * highest:.2g} mm/s"

@@ -12,7 +12,7 @@ from geometry.grids.grid import Grid
 
 from .checks import refuse_implausible
 from .errors import RecordingError
-from .recording import LAYOUT, REQUIRED, Recording, Wall
+from .recording import LAYOUT, OF_A_WALL, REQUIRED, Recording, Wall
 from .rules import check_recording
 from .units import factor
 
@@ -67,6 +67,12 @@ def _read(file: h5py.File, source: str) -> Recording:
             raise RecordingError(source, dataset, "is required but missing")
         if node is not None:
             arrays[dataset] = _load(node, dataset, kind, source)
+    there = [dataset for dataset in arrays if dataset.startswith("/wall/")]
+    for dataset in OF_A_WALL if there else ():
+        if dataset not in arrays:
+            raise RecordingError(
+                source, dataset, f"is required but missing, beside {there[0]}; or leave all of /wall out"
+            )
     velocity = arrays["/velocity"]
     if velocity.ndim != dimension + 2:
         rule = f"must have {dimension + 2} axes in {dimension} dimensions, not the shape {velocity.shape}"
@@ -80,7 +86,7 @@ def _read(file: h5py.File, source: str) -> Recording:
     try:
         return Recording(
             grid=grid,
-            wall=Wall(**wall),
+            wall=Wall(**wall) if wall else None,
             period=period,
             description=_text(file, "description"),
             **numbers,

@@ -38,7 +38,8 @@ LAYOUT: tuple[tuple[str, str, type], ...] = (
     ("flux_mitral", "/flux/mitral", np.float64),
     ("flux_aortic", "/flux/aortic", np.float64),
 )
-REQUIRED = ("/time", "/velocity", "/mask", "/wall/vertices", "/wall/faces", "/wall/region")
+REQUIRED = ("/time", "/velocity", "/mask")
+OF_A_WALL = ("/wall/vertices", "/wall/faces", "/wall/region")  # all of them, or no wall at all
 
 
 # what `Recording.check` goes through: `rules` enters itself here, because it has to know recordings
@@ -49,9 +50,11 @@ RULES: list[Callable[[Recording, str], None]] = []
 class Wall:
     """The closed surface around the blood at every frame, same faces throughout.
 
-    `vertices` `(T, nv, D)` or, at rest, `(nv, D)`, m; `faces` `(nf, D)`, outward; `region` `(nf,)`: 0 wall, 1
-    mitral inlet, 2 aortic outlet, further ones free; `velocity` `(T, nv, D)`, m/s, or None, then it follows
-    from `vertices`.
+    Args:
+        vertices: (T, nv, D) or, at rest, (nv, D), m.
+        faces: (nf, D), vertex numbers, normals outwards.
+        region: (nf,), 0 wall, 1 mitral inlet, 2 aortic outlet, further ones free.
+        velocity: (T, nv, D), m/s, or None: it then follows from `vertices`.
     """
 
     vertices: np.ndarray
@@ -81,20 +84,36 @@ class Wall:
 class Recording:
     """Velocity volumes with their walls and valves; `None` stands for an optional dataset that is not there.
 
-    `time` (T,) s; `velocity` (T, D, *shape) m/s; `mask` (T, *shape) bool, one mask `shape` is repeated for
-    every frame; `rho` kg/m^3; `mu` Pa s; `period` s, 0 = not periodic; `weight` (T, *shape) in [0, 1];
-    `sigma` (T, D, *shape) m/s; `uncovered` (T,) nodes; `beam` (T, D, *shape) or (D, *shape) unit vectors;
-    `pressure` (T, *shape) Pa; `valve_intervals` (n, 3) rows (region, opens, closes), s; `valve_open` (T, 2);
-    `volume` (T,) m^3; `flux_mitral`, `flux_aortic` (T,) m^3/s, positive into the ventricle.
+    Args:
+        time: (T,), s, increasing.
+        grid: where the values are.
+        velocity: (T, D, *shape), m/s; 0 outside the mask.
+        mask: (T, *shape) or, for every frame, (*shape), bool: inside the blood.
+        wall: around the blood; None where nobody knows it (plane PIV, tracks on a grid).
+        rho: kg/m^3.
+        mu: Pa s.
+        period: s, 0 = not periodic.
+        description: in words.
+        weight: (T, *shape), confidence in [0, 1]; the velocity may be NaN where it is 0.
+        sigma: (T, D, *shape), m/s, standard deviation of each component.
+        uncovered: (T,), nodes inside the mask for which a method has no value.
+        beam: (T, D, *shape) or (D, *shape), unit vectors along which alone the velocity was measured.
+        pressure: (T, *shape), Pa, gauge.
+        valve_intervals: (n, 3), rows (region, opens, closes), s.
+        valve_open: (T, 2), regions 1 and 2 open at the frames; used where there are no intervals.
+        volume: (T,), m^3.
+        flux_mitral: (T,), m^3/s, positive into the ventricle.
+        flux_aortic: (T,), m^3/s, likewise.
 
-    Raises RecordingError where shapes disagree; `geometry.check_recording` tests every rule of the format.
+    Raises:
+        RecordingError: shapes that disagree; `geometry.check_recording` tests every rule of the format.
     """
 
     time: np.ndarray
     grid: Grid
     velocity: np.ndarray
     mask: np.ndarray
-    wall: Wall
+    wall: Wall | None
     rho: float
     mu: float
     period: float = 0.0
@@ -132,7 +151,7 @@ class Recording:
         """The arrays that are there, by the name of their dataset in the file."""
         found = {}
         for name, dataset, _ in LAYOUT:
-            value = getattr(self.wall, name[5:]) if name.startswith("wall.") else getattr(self, name)
+            value = getattr(self.wall, name[5:], None) if name.startswith("wall.") else getattr(self, name)
             if value is not None:
                 found[dataset] = value
         return found
@@ -149,13 +168,27 @@ class Recording:
         for rules in RULES:
             rules(self, source)
 
+    def wall_for(self, purpose: str) -> Wall:
+        """The wall, for what cannot do without one.
+
+        Args:
+            purpose: who asks, say "the simulator"; it opens the message.
+
+        Raises:
+            RecordingError: the recording has no wall.
+        """
+        if self.wall is None:
+            rule = "is not in this recording; geometry.surface_from_mask makes a surface of the mask"
+            raise RecordingError(purpose, "/wall", rule)
+        return self.wall
+
     def select(self, frames: slice | Sequence[int] | np.ndarray) -> Recording:
         """Some of the frames, in increasing order of time: a slice, frame numbers or a bool for each frame.
 
         The period stays what it is: frames left out do not change the motion that they sample.
         """
         chosen = np.arange(self.frames)[frames if isinstance(frames, slice) else np.asarray(frames)]
-        changes: dict[str, Any] = {"wall": self.wall.select(chosen)}
+        changes: dict[str, Any] = {"wall": None if self.wall is None else self.wall.select(chosen)}
         for name, _, _ in LAYOUT:
             value = None if name.startswith("wall.") else getattr(self, name)
             still = name == "valve_intervals" or (
@@ -226,9 +259,7 @@ def _check_shapes(recording: Recording) -> None:
 def _allowed_shapes(recording: Recording) -> dict[str, tuple[tuple[int, ...], ...]]:
     """The shapes that each dataset may have, given the frames, the grid and the size of the wall."""
     frames, dimension, shape = recording.time.shape[0], recording.grid.dimension, recording.grid.shape
-    wall, intervals = recording.wall, recording.valve_intervals
-    points = (wall.vertices.shape[-2] if wall.vertices.ndim in (2, 3) else 0, dimension)
-    faces = wall.faces.shape[0] if wall.faces.ndim else 0
+    intervals = recording.valve_intervals
     return {
         "/velocity": ((frames, dimension, *shape),),
         "/mask": ((frames, *shape),),
@@ -237,13 +268,21 @@ def _allowed_shapes(recording: Recording) -> dict[str, tuple[tuple[int, ...], ..
         "/uncovered": ((frames,),),
         "/beam": ((frames, dimension, *shape), (dimension, *shape)),
         "/pressure": ((frames, *shape),),
-        "/wall/vertices": ((frames, *points), points),
-        "/wall/faces": ((faces, dimension),),
-        "/wall/region": ((faces,),),
-        "/wall/velocity": ((frames, *points),),
+        **({} if recording.wall is None else _allowed_wall_shapes(recording.wall, frames, dimension)),
         "/valve/intervals": ((len(intervals) if intervals is not None and intervals.ndim else 0, 3),),
         "/valve_open": ((frames, 2),),
         "/volume": ((frames,),),
         "/flux/mitral": ((frames,),),
         "/flux/aortic": ((frames,),),
+    }
+
+
+def _allowed_wall_shapes(wall: Wall, frames: int, dimension: int) -> dict[str, tuple[tuple[int, ...], ...]]:
+    points = (wall.vertices.shape[-2] if wall.vertices.ndim in (2, 3) else 0, dimension)
+    faces = wall.faces.shape[0] if wall.faces.ndim else 0
+    return {
+        "/wall/vertices": ((frames, *points), points),
+        "/wall/faces": ((faces, dimension),),
+        "/wall/region": ((faces,),),
+        "/wall/velocity": ((frames, *points),),
     }

@@ -95,7 +95,7 @@ def _finite(recording: Recording, source: str) -> None:
 def _speed(recording: Recording, source: str) -> None:
     with np.errstate(invalid="ignore", over="ignore"):
         speed = np.sqrt((recording.velocity.astype(np.float64) ** 2).sum(axis=1))
-        wall = recording.wall.velocity
+        wall = None if recording.wall is None else recording.wall.velocity
         moving = np.zeros(0) if wall is None else np.sqrt((wall.astype(np.float64) ** 2).sum(axis=-1))
     inside = speed[measured_nodes(recording)]
     for dataset, values in (("/velocity", inside), ("/wall/velocity", moving)):
@@ -125,6 +125,8 @@ def _beam(recording: Recording, source: str) -> None:
 
 def _wall(recording: Recording, source: str) -> None:
     wall = recording.wall
+    if wall is None:
+        return
     for dataset, values in (("/wall/vertices", wall.vertices), ("/wall/velocity", wall.velocity)):
         if values is not None and not np.isfinite(values).all():
             raise RecordingError(source, dataset, "must be finite everywhere")
@@ -145,6 +147,8 @@ def _wall(recording: Recording, source: str) -> None:
 
 
 def _overlap(recording: Recording, source: str) -> None:
+    if recording.wall is None:
+        return
     used = recording.wall.vertices[..., np.unique(recording.wall.faces), :].reshape(-1, recording.dimension)
     lower, upper = used.min(axis=0), used.max(axis=0)
     grid = recording.grid

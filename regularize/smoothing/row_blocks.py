@@ -7,44 +7,12 @@ import torch
 
 from regularize.basis.knots import Knots
 from regularize.errors import InvalidInput
-from regularize.options import SplineOptions
+from regularize.options import SplineOptions, length_of
 from regularize.rows.operators import CellRows, DirectionRows, DivergenceRows, RowBlock, System, VectorRows
 from regularize.rows.penalties import curvature_gram, divergence_gram, row_factor
 from regularize.rows.walls import WallRows
 
 from .samples import FitData
-
-
-def knots_for(data: FitData, options: SplineOptions) -> Knots:
-    """The knot grid around the data: of a given spacing, or of given counts with the longest side first."""
-    sides = [b - a for a, b in zip(data.lower, data.upper, strict=True)]
-    if options.nodes is not None:
-        if data.over_time:
-            raise InvalidInput("nodes fixes a grid in space alone: over time give knots and time_knots")
-        return _knots_of_counts(data, options.nodes, sides, options.degree)
-    spacing, space = options.knots, data.components
-    each = [float(spacing)] * space if isinstance(spacing, int | float) else list(spacing or ())
-    if data.over_time:
-        if options.time_knots is None:
-            raise InvalidInput("points hold a time column: give time_knots, the knot distance in s")
-        each.append(options.time_knots)
-    if len(each) != len(sides):
-        raise InvalidInput(f"knots has {len(each)} entries for {len(sides)} axes")
-    return Knots.covering(data.lower, data.upper, each, options.degree)
-
-
-def _knots_of_counts(data: FitData, nodes: tuple[int, ...], sides: list[float], degree: int) -> Knots:
-    if len(nodes) < len(sides):
-        raise InvalidInput(f"nodes has {len(nodes)} entries for {len(sides)} axes")
-    counts = sorted(nodes, reverse=True)[: len(sides)]
-    cells = [0] * len(sides)
-    for rank, axis in enumerate(sorted(range(len(sides)), key=lambda k: -sides[k])):
-        cells[axis] = counts[rank] - degree
-    longest = max(max(sides), 1e-12)
-    # A box flat along an axis still needs a positive spacing there.
-    step = [max(side, 1e-3 * longest) / n for side, n in zip(sides, cells, strict=True)]
-    origin = [(a + b - n * h) / 2 for a, b, n, h in zip(data.lower, data.upper, cells, step, strict=True)]
-    return Knots(tuple(origin), tuple(step), tuple(cells), degree)
 
 
 def build_system(options: SplineOptions, knots: Knots, data: FitData) -> System:
@@ -55,9 +23,10 @@ def build_system(options: SplineOptions, knots: Knots, data: FitData) -> System:
 def _thesis_system(options: SplineOptions, knots: Knots, data: FitData) -> System:
     components = data.components
     blocks: list[RowBlock] = [sample_rows(knots, data, data.weight[:, None])]
-    if options.divergence:
+    divergence = length_of(options.divergence)
+    if divergence:
         where = data.points if data.divergence_points is None else data.divergence_points
-        per_spacing = options.divergence * sum(knots.spacing[:components]) / components
+        per_spacing = divergence * sum(knots.spacing[:components]) / components
         blocks.append(DivergenceRows(knots, where, components, torch.full_like(where[:, 0], per_spacing)))
     if data.wall is not None:
         root = data.wall.weight.sqrt()
@@ -88,20 +57,21 @@ def penalty_blocks(
 ) -> tuple[list[RowBlock], torch.Tensor, float]:
     """Rows of all penalties in the density scaling, the cells they cover, and the damping's row factor."""
     components, extent = data.components, data.extent(knots)
+    divergence, curvature = length_of(options.divergence), length_of(options.curvature)
     blocks: list[RowBlock] = []
     if data.wall is not None and float(data.wall.weight.sum()) > 0:
         blocks += _wall_blocks(knots, data.wall, options.wall, options.no_slip, wall_roots(data.wall))
     where = data.divergence_points
-    if where is not None and len(where) and options.divergence:
-        each = torch.full_like(where[:, 0], options.divergence / len(where) ** 0.5)
+    if where is not None and len(where) and divergence:
+        each = torch.full_like(where[:, 0], divergence / len(where) ** 0.5)
         blocks.append(DivergenceRows(knots, where, components, each))
     cells = torch.unique(torch.cat([knots.cell_number(block.cell) for block in [*fit, *blocks]]))
     cells = knots.cell_index(cells)
-    if where is None and options.divergence:
+    if where is None and divergence:
         factor = row_factor(divergence_gram(knots, components), components).to(data.points)
-        blocks.append(CellRows(knots, cells, options.divergence / extent**0.5 * factor, components))
-    if options.curvature:
-        gram = options.curvature ** (2 * options.order) * smoothness_gram(options, knots, data)
+        blocks.append(CellRows(knots, cells, divergence / extent**0.5 * factor, components))
+    if curvature:
+        gram = curvature ** (2 * options.order) * smoothness_gram(options, knots, data)
         factor = row_factor(gram).to(data.points) / extent**0.5
         blocks.append(CellRows(knots, cells, factor, components))
     return blocks, cells, (options.damping or 0.0) * (prod(knots.spacing) / extent) ** 0.5
@@ -110,8 +80,8 @@ def penalty_blocks(
 def smoothness_gram(options: SplineOptions, knots: Knots, data: FitData) -> np.ndarray:
     """(L, L) cell integral of |grad^m v|^2, plus (time_curvature / curvature)^2m |d^m v / dt^m|^2, m the order."""
     gram = curvature_gram(knots, range(data.components), options.order)
-    if data.over_time and options.time_curvature:
-        ratio = options.time_curvature / (options.curvature or 1.0)
+    if data.over_time and length_of(options.time_curvature):
+        ratio = length_of(options.time_curvature) / (length_of(options.curvature) or 1.0)
         gram = gram + ratio ** (2 * options.order) * curvature_gram(knots, [data.components], options.order)
     return gram
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import torch
 
 from regularize.basis.knots import Knots
-from regularize.options import SplineOptions
+from regularize.options import SplineOptions, length_of
 from regularize.rows.operators import CellRows, DivergenceRows, VectorRows
 from regularize.rows.penalties import row_factor
 from regularize.solvers.direct import solve_direct
@@ -57,7 +57,8 @@ def choose(options: SplineOptions, knots: Knots, data: FitData) -> Choice | None
     with torch.no_grad():
         if options.automatic == "gcv":
             return cross_validate(search, options.no_slip, options.rounds)
-        choice = search.run(guess, options.curvature or 0.0, options.no_slip, options.divergence, options.rounds)
+        divergence = length_of(options.divergence) if options.divergence is not None else None
+        choice = search.run(guess, length_of(options.curvature), options.no_slip, divergence, options.rounds)
         return _counting_shared_errors(options, coarse, data, choice) if options.correlated else choice
 
 

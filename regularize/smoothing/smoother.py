@@ -7,7 +7,7 @@ import torch
 
 from regularize.basis.knots import Knots
 from regularize.errors import InvalidInput
-from regularize.options import SplineOptions
+from regularize.options import BY_DATA, LOW_NOISE, SAMPLES_OF_LOW_NOISE, SAMPLES_PER_KNOT, SplineOptions
 from regularize.rows.operators import System
 from regularize.rows.walls import WallRows
 from regularize.solvers.direct import solve_direct
@@ -19,8 +19,9 @@ from regularize.statistics.likelihood import Choice
 from regularize.statistics.robust import robust_weight
 
 from .field import SplineField
+from .knot_grid import knots_for
 from .problem import Problem
-from .row_blocks import build_system, knots_for
+from .row_blocks import build_system
 from .samples import FitData
 from .search import choose
 
@@ -77,7 +78,7 @@ class Smoother(SplineOptions):
         traced = data.velocity.requires_grad or data.weight.requires_grad
         if traced and (self.automatic or beam is not None or self.solver not in ("auto", "direct")):
             raise InvalidInput("gradients need fixed(...) options, full vectors and the direct solver")
-        problem = self._problem(data) if choice is None else self._following(data, choice)
+        problem = self._problem(data, choice)
         name = self._solver_for(problem.system, needs_factor=uncertainty or traced)
         solver = SOLVERS[name]
         if uncertainty and not solver.factors:
@@ -133,27 +134,34 @@ class Smoother(SplineOptions):
         data = every[judged or 0]
         if judged is None:
             data = replace(data, velocity=torch.stack([d.velocity for d in every]).mean(0))
-        problem = self._problem(data) if choice is None else self._following(data, choice)
+        problem = self._problem(data, choice)
         return problem.solve_all([one.velocity for one in every], self.tolerance, self.strict)
 
-    def _problem(self, data: FitData) -> Problem:
-        knots = knots_for(data, self)
-        choice = choose(self, knots, data) if self.automatic else None
-        if choice is not None:
-            return self._with_choice(knots, data, choice)
-        return Problem(data, build_system(self.fixed(), knots, data), None)
+    def _problem(self, data: FitData, choice: Choice | None = None) -> Problem:
+        """The assembled fit; with another frame's ``choice``, noise, curvature and slip are that frame's."""
+        given = choice
+        for per_knot in (SAMPLES_PER_KNOT, SAMPLES_OF_LOW_NOISE):
+            knots = knots_for(data, self, per_knot)
+            options = self.for_knots(knots.spacing, data.components)
+            if given is None:
+                choice = choose(options, knots, data) if self.automatic else None
+            if self.knots != BY_DATA or choice is None or not _low_noise(choice, data):
+                break
+        if choice is None:
+            return Problem(data, build_system(options.fixed(), knots, data), None)
+        return options._with_choice(knots, data, choice) if given is None else options._following(knots, data, given)
 
-    def _following(self, data: FitData, choice: Choice) -> Problem:
+    def _following(self, knots: Knots, data: FitData, choice: Choice) -> Problem:
         """The problem with another frame's noise, curvature and slip, and this frame's own outliers."""
         choice = replace(choice, robust=torch.ones_like(data.weight))
-        problem = self._with_choice(knots_for(data, self), data, choice)
+        problem = self._with_choice(knots, data, choice)
         if self.robust is None:
             return problem
         solution, _ = solve_direct(problem.system, tolerance=max(self.tolerance, 1e-4))
         predicted = problem.field(solution)(data.points, outside=0.0).to(problem.samples.target)
         weight = robust_weight(data.velocity.to(predicted) - predicted, self.robust, data.weight > 0)
         choice = replace(choice, robust=weight.to(data.weight))
-        return self._with_choice(problem.system.knots, data, choice)
+        return self._with_choice(knots, data, choice)
 
     def _with_choice(self, knots: Knots, data: FitData, choice: Choice) -> Problem:
         data = data.reweighed(choice)
@@ -175,3 +183,9 @@ class Smoother(SplineOptions):
         if neighbour is None:
             return None
         return Neighbour(neighbour.knots, neighbour.coefficients.flatten(1).T, neighbour.factor)
+
+
+def _low_noise(choice: Choice, data: FitData) -> bool:
+    """Whether the noise found is a small part of what the samples show."""
+    found = torch.tensor(choice.noise, dtype=torch.float64).square().mean()
+    return bool(found < LOW_NOISE**2 * data.velocity.double().square().mean())

@@ -12,6 +12,12 @@ WORTH_COUNTING = 1 << 28  # bytes: a smaller bound settles the question without 
 COPIES = {"cpu": 1, "cuda": 3}  # of the band: factored in place, or cut into dense blocks beside it
 
 
+def factor_work(system: System) -> float:
+    """Multiplications of a banded factorisation of the coefficients that ``system`` touches."""
+    ordering = order(system)
+    return len(ordering.nodes) * system.components * float((ordering.half_bandwidth + 1) * system.components) ** 2
+
+
 def band_bytes(system: System) -> int:
     """Bytes that the factor of ``system`` takes; an upper bound where that is small anyway."""
     knots, c = system.knots, system.components

@@ -286,10 +286,9 @@ class LikelihoodSearch:
         self.rank = len(probe) - ridge * float((probe * ridged.solve(probe)).sum()) / PROBES
         self.data_probes = ridged.spread(self.signs).view(len(probe), self.components, PROBES)
 
-    @staticmethod
-    def _settled(old: Precisions, new: Precisions) -> bool:
+    def _settled(self, old: Precisions, new: Precisions) -> bool:
         fit = float(((new.fit - old.fit) / old.fit).abs().max())
         rough = abs(new.rough / old.rough - 1.0)
-        slip = abs(new.slip - old.slip) / (old.slip + FLOOR * old.rough + 1e-300)
+        slip = abs(new.slip - old.slip) / (old.slip + FLOOR * self.scale(old.fit))
         free = abs(new.divergence - old.divergence) / (old.divergence + 1e-300)
         return max(fit, rough, slip, free) < SETTLED

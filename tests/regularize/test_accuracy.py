@@ -2,10 +2,9 @@
 
 import pytest
 import torch
+from regularize_cases import smoother
 
-from regularize import Smoother
-
-LIGHT = Smoother(divergence=1e-3, curvature=2e-5, damping=1e-6, wall=None, no_slip=None).fixed()
+LIGHT = smoother(divergence=1e-3, curvature=2e-5, damping=1e-6, wall=None, no_slip=None).fixed()
 AXES = torch.tensor([40e-3, 20e-3, 20e-3], dtype=torch.float64)  # semi-axes of an ellipsoid, m
 
 

@@ -2,12 +2,14 @@
 
 import pytest
 import torch
+from regularize_cases import smoother
 
-from regularize import InvalidInput, NotConverged, PreparedSystem, Smoother, pcg
-from regularize.smoothing.row_blocks import build_system, knots_for
+from regularize import InvalidInput, NotConverged, PreparedSystem, pcg
+from regularize.smoothing.knot_grid import knots_for
+from regularize.smoothing.row_blocks import build_system
 from regularize.smoothing.samples import FitData
 
-OPTIONS = Smoother(automatic=None, robust=None, divergence=10e-3)
+OPTIONS = smoother(automatic=None, robust=None, divergence=10e-3)
 BOX = ((0.0, 0.0, 0.0), (12e-3, 12e-3, 15e-3))
 
 
@@ -76,19 +78,19 @@ def test_many_right_hand_sides_equal_single_fits():
 
 def test_many_right_hand_sides_with_automatic_choice_share_it():
     points, velocity, weight = frame(0)
-    fields = Smoother().fit_many(points, torch.stack([velocity, 1.1 * velocity]), weight)
+    fields = smoother().fit_many(points, torch.stack([velocity, 1.1 * velocity]), weight)
     assert fields[0].choice is fields[1].choice and fields[0].choice.curvature > 0
     with pytest.raises(InvalidInput, match="velocities"):
-        Smoother().fit_many(points, velocity, weight)
+        smoother().fit_many(points, velocity, weight)
 
 
 def test_another_frames_choice_is_taken_over_but_outliers_are_judged_anew():
     points, velocity, weight = frame(0)
     noise = 0.1 * torch.randn(velocity.shape, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
-    first = Smoother().fit(points, velocity + noise, weight)
+    first = smoother().fit(points, velocity + noise, weight)
     spoilt = velocity - noise
     spoilt[5] += 10.0
-    second = Smoother().fit(points, spoilt, weight, choice=first.choice)
+    second = smoother().fit(points, spoilt, weight, choice=first.choice)
     assert second.choice.noise == first.choice.noise and second.choice.curvature == first.choice.curvature
     assert float(second.choice.robust[5]) == 0 and float(first.choice.robust[5]) > 0
     assert float((second(points) - velocity).square().mean().sqrt()) < 0.06

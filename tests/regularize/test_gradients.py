@@ -2,10 +2,11 @@
 
 import pytest
 import torch
+from regularize_cases import smoother
 
-from regularize import InvalidInput, Smoother
+from regularize import InvalidInput
 
-OPTIONS = Smoother(knots=6e-3, divergence=3e-3, curvature=1e-3, wall=None, no_slip=None).fixed()
+OPTIONS = smoother(knots=6e-3, divergence=3e-3, curvature=1e-3, wall=None, no_slip=None).fixed()
 
 
 def samples(n=40, axes=2):
@@ -43,6 +44,6 @@ def test_gradient_of_the_divergence_flows_too():
 def test_where_gradients_cannot_flow_they_are_refused():
     points, velocity, weight = samples()
     with pytest.raises(InvalidInput, match="gradients"):
-        Smoother().fit(points, velocity, weight)
+        smoother().fit(points, velocity, weight)
     with pytest.raises(InvalidInput, match="gradients"):
         OPTIONS.fixed(solver="lsqr").fit(points, velocity, weight)

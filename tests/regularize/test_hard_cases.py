@@ -5,10 +5,11 @@ from dataclasses import replace
 
 import pytest
 import torch
+from regularize_cases import smoother
 
-from regularize import NotConverged, Smoother, WallRows
+from regularize import NotConverged, WallRows
 
-FIXED = Smoother(wall=None, no_slip=None).fixed()
+FIXED = smoother(wall=None, no_slip=None).fixed()
 
 
 def cloud(n=1500, sides=(12e-3, 12e-3, 12e-3), seed=0):
@@ -54,11 +55,11 @@ def test_ten_percent_outliers():
     points = cloud(4000)
     generator = torch.Generator().manual_seed(1)
     measured = flow(points) + 0.1 * torch.randn(4000, 3, generator=generator, dtype=torch.float64)
-    clean = Smoother(wall=None, no_slip=None).fit(points, measured)
+    clean = smoother(wall=None, no_slip=None).fit(points, measured)
     hit = torch.rand(4000, generator=generator) < 0.1
     spoilt = torch.where(hit[:, None], 4 * torch.randn(4000, 3, generator=generator, dtype=torch.float64), measured)
-    robust = Smoother(wall=None, no_slip=None).fit(points, spoilt)
-    plain = Smoother(wall=None, no_slip=None, robust=None).fit(points, spoilt)
+    robust = smoother(wall=None, no_slip=None).fit(points, spoilt)
+    plain = smoother(wall=None, no_slip=None, robust=None).fit(points, spoilt)
     errors = [relative_error(field, points, flow(points)) for field in (clean, robust, plain)]
     assert errors[1] < 1.3 * errors[0] and errors[1] < 0.5 * errors[2]
 
@@ -92,7 +93,7 @@ def test_rank_deficient_system_is_solved_by_a_breath_of_damping():
 
 def test_single_precision_field_equals_double_within_1e_4():
     points, wall = cloud(), box_wall()
-    for options in (Smoother(), Smoother().fixed(), Smoother(divergence=0.3, wall=10.0).fixed()):
+    for options in (smoother(), smoother().fixed(), smoother(divergence=0.3, wall=10.0).fixed()):
         double = options.fit(points, flow(points), wall=wall)
         single = options.fit(points.float(), flow(points).float(), wall=wall)
         difference = (single(points.float()).double() - double(points)).norm() / double(points).norm()
@@ -117,7 +118,7 @@ def test_walls_that_cross_the_edge_of_the_box_are_counted():
 def test_domain_two_nodes_thin():
     points = cloud(800, (12e-3, 12e-3, 1e-3))
     points[:, 2] = (points[:, 2] > 0.5e-3) * 1e-3
-    for options in (FIXED, Smoother()):
+    for options in (FIXED, smoother()):
         assert relative_error(options.fit(points, flow(points)), points, flow(points)) < 0.25
 
 
@@ -137,9 +138,9 @@ def test_many_coincident_samples_count_as_their_mean():
 
 def test_fluid_at_rest_and_uniform_flow():
     points = cloud(400)
-    assert float(Smoother().fit(points, torch.zeros_like(points)).coefficients.abs().max()) == 0
+    assert float(smoother().fit(points, torch.zeros_like(points)).coefficients.abs().max()) == 0
     uniform = torch.tensor([[0.1, -0.2, 0.3]]).double().expand(400, 3)
-    assert torch.allclose(Smoother(wall=None).fit(points, uniform)(points), uniform, atol=1e-6)
+    assert torch.allclose(smoother(wall=None).fit(points, uniform)(points), uniform, atol=1e-6)
 
 
 def test_mean_of_a_field_over_a_sphere_survives():

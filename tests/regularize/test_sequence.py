@@ -2,10 +2,11 @@
 
 import pytest
 import torch
+from regularize_cases import smoother
 
-from regularize import InvalidInput, Smoother, blur_in_time, fit_windows
+from regularize import InvalidInput, blur_in_time, fit_windows
 
-OPTIONS = Smoother(wall=None, no_slip=None, divergence=1e-3, curvature=2e-4).fixed()
+OPTIONS = smoother(wall=None, no_slip=None, divergence=1e-3, curvature=2e-4).fixed()
 BOX = ((0.0, 0.0), (12e-3, 12e-3))
 
 

@@ -5,9 +5,11 @@ from dataclasses import replace
 
 import pytest
 import torch
+from regularize_cases import smoother
 
 from regularize import InvalidInput, NotConverged, PreparedSystem, Smoother, WallRows
-from regularize.smoothing.row_blocks import build_system, knots_for
+from regularize.smoothing.knot_grid import knots_for
+from regularize.smoothing.row_blocks import build_system
 from regularize.smoothing.samples import FitData
 from regularize.solvers.memory import band_bytes, device_memory
 
@@ -39,14 +41,14 @@ def sphere(n, radius, centre):
 def test_cubic_polynomials_are_reproduced(axes, degree):
     points = cloud(1500, axes)
     velocity = torch.stack([(100 * points[:, k]) ** 3 - 50 * points[:, 0] for k in range(axes)], dim=1)
-    field = Smoother(knots=3e-3, degree=degree, **PLAIN).fit(points, velocity)
+    field = smoother(knots=3e-3, degree=degree, **PLAIN).fit(points, velocity)
     test = cloud(200, axes, seed=1) * 0.9 + 0.5e-3
     exact = torch.stack([(100 * test[:, k]) ** 3 - 50 * test[:, 0] for k in range(axes)], dim=1)
     assert torch.allclose(field(test), exact, atol=1e-6)
 
 
 def test_derivatives_equal_autodiff_of_the_field():
-    field = Smoother().fit(cloud(), rotation(cloud()))
+    field = smoother().fit(cloud(), rotation(cloud()))
     point = cloud(5, seed=3).requires_grad_()
     value = field(point)
     for k in range(3):
@@ -62,23 +64,23 @@ def test_weight_power_means_weight_to_twice_the_power_in_the_cost():
         torch.rand(600, generator=torch.Generator().manual_seed(5), dtype=torch.float64) + 0.1,
     )
     velocity = rotation(points)
-    squared = Smoother(power=2.0, **GIVEN).fit(points, velocity, w).coefficients
-    assert torch.allclose(squared, Smoother(power=1.0, **GIVEN).fit(points, velocity, w**2).coefficients, atol=1e-10)
-    assert not torch.allclose(squared, Smoother(power=1.0, **GIVEN).fit(points, velocity, w).coefficients, atol=1e-4)
+    squared = smoother(power=2.0, **GIVEN).fit(points, velocity, w).coefficients
+    assert torch.allclose(squared, smoother(power=1.0, **GIVEN).fit(points, velocity, w**2).coefficients, atol=1e-10)
+    assert not torch.allclose(squared, smoother(power=1.0, **GIVEN).fit(points, velocity, w).coefficients, atol=1e-4)
 
 
 def test_doubled_samples_and_scaled_weights_change_nothing():
     points, velocity = cloud(), rotation(cloud())
-    once = Smoother(**GIVEN).fit(points, velocity).coefficients
-    twice = Smoother(**GIVEN).fit(points.repeat(2, 1), velocity.repeat(2, 1), torch.full((1200,), 0.5)).coefficients
+    once = smoother(**GIVEN).fit(points, velocity).coefficients
+    twice = smoother(**GIVEN).fit(points.repeat(2, 1), velocity.repeat(2, 1), torch.full((1200,), 0.5)).coefficients
     assert torch.allclose(once, twice, atol=1e-9)
 
 
 def test_larger_box_changes_nothing_inside():
     points, velocity = cloud(), rotation(cloud())
     step, lower, upper = 3e-3, (0.0, 0.0, 0.0), (12e-3, 9e-3, 15e-3)
-    small = Smoother(knots=step, **GIVEN).fit(points, velocity, box=(lower, upper))
-    wide = Smoother(knots=step, **GIVEN).fit(points, velocity, box=([-2 * step] * 3, [u + 4 * step for u in upper]))
+    small = smoother(knots=step, **GIVEN).fit(points, velocity, box=(lower, upper))
+    wide = smoother(knots=step, **GIVEN).fit(points, velocity, box=([-2 * step] * 3, [u + 4 * step for u in upper]))
     assert torch.allclose(small(points), wide(points), atol=1e-8)
 
 
@@ -88,7 +90,7 @@ def test_moving_wall_right_hand_side():
     where, normals = sphere(400, 5e-3, centre)
     wall = WallRows(where, normals, 0.2 * normals, no_slip=torch.zeros(400, dtype=torch.bool))
     inside = sphere(200, 2e-3, centre)[0]
-    options = Smoother(divergence=None, wall=1e3, no_slip=None, curvature=0.5e-3, **GIVEN)
+    options = smoother(divergence=None, wall=1e3, no_slip=None, curvature=0.5e-3, **GIVEN)
     field = options.fit(inside, torch.zeros_like(inside), wall=wall)
     assert torch.allclose((field(where) * normals).sum(1), torch.full((400,), 0.2, dtype=torch.float64), atol=5e-3)
     fixed = options.fit(inside, torch.zeros_like(inside), wall=WallRows(where, normals, 0 * normals))
@@ -100,7 +102,7 @@ def test_no_slip_holds_the_whole_vector_and_only_where_asked():
     where, normals = sphere(400, 5e-3, centre)
     inside = sphere(300, 4e-3, centre)[0]
     flow = torch.linalg.cross(inside - centre, torch.tensor([[0.0, 0, 50.0]], dtype=torch.float64).expand(300, 3))
-    options = Smoother(divergence=None, wall=100.0, no_slip=100.0, curvature=0.2e-3, **GIVEN)
+    options = smoother(divergence=None, wall=100.0, no_slip=100.0, curvature=0.2e-3, **GIVEN)
     slip = torch.zeros(400, dtype=torch.bool)
     free = options.fit(inside, flow, wall=WallRows(where, normals, 0 * normals, no_slip=slip))
     held = options.fit(inside, flow, wall=WallRows(where, normals, 0 * normals, no_slip=~slip))
@@ -110,8 +112,8 @@ def test_no_slip_holds_the_whole_vector_and_only_where_asked():
 def test_strong_divergence_rows():
     points = cloud(2000)
     noisy = rotation(points) + 0.1 * torch.randn(2000, 3, generator=torch.Generator().manual_seed(0)).double()
-    field = Smoother(divergence=0.1, **GIVEN).fit(points, noisy)
-    free = Smoother(divergence=None, **GIVEN).fit(points, noisy)
+    field = smoother(divergence=0.1, **GIVEN).fit(points, noisy)
+    free = smoother(divergence=None, **GIVEN).fit(points, noisy)
     ratio = [f.divergence(points).norm() / f.gradient(points).norm() for f in (field, free)]
     assert ratio[0] < 0.1 * ratio[1]
 
@@ -170,7 +172,7 @@ def test_thesis_scaling_is_eq_3_22():
 
 def test_solvers_and_precisions_agree():
     points, velocity = cloud(), rotation(cloud())
-    options = Smoother(divergence=3e-3, damping=1e-2, **GIVEN)
+    options = smoother(divergence=3e-3, damping=1e-2, **GIVEN)
     direct = options.fit(points, velocity)(points)
     iterative = replace(options, solver="lsqr", tolerance=1e-8).fit(points, velocity)
     assert torch.allclose(iterative(points), direct, atol=1e-5)
@@ -181,7 +183,7 @@ def test_solvers_and_precisions_agree():
 
 def test_the_solver_goes_by_size_and_memory(monkeypatch):
     points, velocity = cloud(), rotation(cloud())
-    options = Smoother(divergence=3e-3, damping=1e-2, **GIVEN)
+    options = smoother(divergence=3e-3, damping=1e-2, **GIVEN)
     direct = options.fit(points, velocity)
     monkeypatch.setattr("regularize.smoothing.smoother.device_memory", lambda device: 1e6)
     small = options.fit(points, velocity)
@@ -193,7 +195,7 @@ def test_the_solver_goes_by_size_and_memory(monkeypatch):
 @pytest.mark.parametrize("axes,degree", [(2, 1), (3, 3)])
 def test_the_memory_of_a_factor_is_foreseen(axes, degree, monkeypatch):
     points = cloud(axes=axes)
-    options = Smoother(degree=degree, divergence=None, curvature=None, **GIVEN)
+    options = smoother(degree=degree, divergence=None, curvature=None, **GIVEN)
     data = FitData.checked(points, points)
     system = build_system(options, knots_for(data, options), data)
     band = PreparedSystem(system).band()
@@ -206,7 +208,7 @@ def test_the_memory_of_a_factor_is_foreseen(axes, degree, monkeypatch):
 
 def test_a_field_that_is_not_converged_comes_only_when_asked_for():
     points, velocity = cloud(), rotation(cloud())
-    options = Smoother(solver="lsmr", max_iterations=5, **GIVEN)
+    options = smoother(solver="lsmr", max_iterations=5, **GIVEN)
     with pytest.raises(NotConverged):
         options.fit(points, velocity)
     field = replace(options, strict=False).fit(points, velocity)
@@ -217,7 +219,7 @@ def test_the_order_of_the_penalty_says_which_polynomials_cost_nothing():
     points = cloud(1500)
     x, y = 100 * points[:, 0], 100 * points[:, 1]
     linear, quadratic = torch.stack([y, x, x], dim=1), torch.stack([y**2, x**2, x * y], dim=1)
-    stiff = Smoother(divergence=None, wall=None, no_slip=None, damping=1e-9, **GIVEN)
+    stiff = smoother(divergence=None, wall=None, no_slip=None, damping=1e-9, **GIVEN)
     for order, flow, kept in ((2, linear, True), (2, quadratic, False), (3, quadratic, True)):
         field = replace(stiff, curvature=30e-3, order=order).fit(points, flow)
         assert torch.allclose(field(points), flow, atol=1e-4) == kept
@@ -225,7 +227,7 @@ def test_the_order_of_the_penalty_says_which_polynomials_cost_nothing():
 
 def test_unsupported_points_are_masked():
     points = cloud(axes=2)
-    field = Smoother().fit(points, points)
+    field = smoother().fit(points, points)
     beyond = torch.tensor([[5e-3, 5e-3], [50e-3, 5e-3]], dtype=torch.float64)
     assert field.supported(beyond).tolist() == [True, False]
     value = field(beyond)
@@ -235,7 +237,7 @@ def test_unsupported_points_are_masked():
 
 
 def test_export_to_grid():
-    field = Smoother().fit(cloud(), rotation(cloud()))
+    field = smoother().fit(cloud(), rotation(cloud()))
     grid = field.grid((1e-3, 2e-3, 3e-3), (1e-3, 1e-3, 2e-3), (4, 3, 2))
     point = torch.tensor([[2e-3, 4e-3, 9e-3]], dtype=torch.float64)  # i = 1, j = 2, k = 3
     assert grid.shape == (3, 4, 3, 2) and torch.allclose(grid[:, 3, 2, 1], field(point)[0])
@@ -244,7 +246,7 @@ def test_export_to_grid():
 @pytest.mark.parametrize("n", [1, 2])
 def test_a_single_sample_or_coincident_ones(n):
     points = torch.full((n, 3), 5e-3, dtype=torch.float64)
-    field = Smoother().fit(points, torch.ones(n, 3, dtype=torch.float64), box=((0, 0, 0), (0.01, 0.01, 0.01)))
+    field = smoother().fit(points, torch.ones(n, 3, dtype=torch.float64), box=((0, 0, 0), (0.01, 0.01, 0.01)))
     assert torch.allclose(field(points), torch.ones(n, 3, dtype=torch.float64), atol=0.02)
 
 
@@ -252,9 +254,9 @@ def test_nan_is_allowed_only_under_zero_weight():
     points, velocity, w = cloud(), rotation(cloud()), torch.ones(600)
     velocity[3] = float("nan")
     with pytest.raises(InvalidInput, match="NaN"):
-        Smoother().fit(points, velocity, w)
+        smoother().fit(points, velocity, w)
     w[3] = 0
-    assert torch.isfinite(Smoother().fit(points, velocity, w).coefficients).all()
+    assert torch.isfinite(smoother().fit(points, velocity, w).coefficients).all()
 
 
 @pytest.mark.parametrize(
@@ -275,17 +277,17 @@ def test_nan_is_allowed_only_under_zero_weight():
 )
 def test_bad_options_are_named(change, word):
     with pytest.raises(InvalidInput, match=word):
-        Smoother(**change).fit(cloud(), rotation(cloud()))
+        smoother(**change).fit(cloud(), rotation(cloud()))
 
 
 def test_bad_arrays_are_named():
     points, velocity = cloud(), rotation(cloud())
     with pytest.raises(InvalidInput, match="nothing to fit"):
-        Smoother().fit(points, velocity, torch.zeros(600))
+        smoother().fit(points, velocity, torch.zeros(600))
     with pytest.raises(InvalidInput, match="outside the box"):
-        Smoother().fit(points, velocity, box=((0, 0, 0), (1e-3, 1e-3, 1e-3)))
+        smoother().fit(points, velocity, box=((0, 0, 0), (1e-3, 1e-3, 1e-3)))
     with pytest.raises(InvalidInput, match="weight"):
-        Smoother().fit(points, velocity, torch.ones(5))
+        smoother().fit(points, velocity, torch.ones(5))
     with pytest.raises(InvalidInput, match="normals"):
         WallRows(points, torch.zeros_like(points), velocity)
     with pytest.raises(InvalidInput, match="preset"):

@@ -2,11 +2,12 @@
 
 import pytest
 import torch
+from regularize_cases import smoother
 
-from regularize import InvalidInput, Smoother, WallRows
+from regularize import InvalidInput, WallRows
 
 PLAIN = {"wall": None, "no_slip": None}
-OPTIONS = Smoother(automatic=None, robust=None, divergence=1e-3, curvature=1e-4, damping=1e-6)
+OPTIONS = smoother(automatic=None, robust=None, divergence=1e-3, curvature=1e-4, damping=1e-6)
 
 
 def spacetime(n=1500, axes=2, seed=0, duration=0.1):
@@ -65,7 +66,7 @@ def test_automatic_choice_over_time():
     x, y, t = (200 * points[:, 0], 200 * points[:, 1], 20 * points[:, 2])
     exact = torch.stack([torch.sin(y + t), torch.cos(x - t)], dim=1)
     noisy = exact + 0.3 * torch.randn(6000, 2, generator=torch.Generator().manual_seed(0)).double()
-    field = Smoother(knots=2e-3, time_knots=0.03, time_curvature=0.01).fit(points, noisy)
+    field = smoother(knots=2e-3, time_knots=0.03, time_curvature=0.01).fit(points, noisy)
     assert field.choice.noise == pytest.approx((0.3, 0.3), rel=0.15)
     error = (field(points) - exact).square().mean().sqrt()
     assert float(error) < 0.1
@@ -106,4 +107,4 @@ def test_bad_beams_are_named():
     with pytest.raises(InvalidInput, match="beam has shape"):
         OPTIONS.fit(points, points, beam=torch.ones(3, 2))
     with pytest.raises(InvalidInput, match="full vectors"):
-        Smoother().fit(points, points, beam=torch.tensor([1.0, 0.0]))
+        smoother().fit(points, points, beam=torch.tensor([1.0, 0.0]))

@@ -2,10 +2,17 @@
 
 import torch
 
-from regularize import CellRows, DirectionRows, DivergenceRows, Knots, System, VectorRows
+from regularize import CellRows, DirectionRows, DivergenceRows, Knots, Smoother, System, VectorRows
 from regularize.rows.penalties import curvature_gram, divergence_gram, row_factor
 
 AXES = (2, 3)
+# Lengths (m) and a time (s) for flows of a centimetre: tests whose subject is another one state them.
+LENGTHS = {"knots": 3e-3, "divergence": 30e-3, "curvature": 1e-3, "time_curvature": 10e-3}
+
+
+def smoother(**options):
+    """A smoother of these lengths, with ``options``."""
+    return Smoother(**LENGTHS | options)
 
 
 def dense_of(operator):

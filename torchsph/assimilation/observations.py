@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -77,7 +78,7 @@ class Observations:
             )
 
     @classmethod
-    def with_floor(cls, value: Tensor, variance: Tensor, floor: float, **others) -> Observations:
+    def with_floor(cls, value: Tensor, variance: Tensor, floor: float, **others: Any) -> Observations:
         """Observations whose variance is raised to at least `floor` (> 0): the cure for exact ones."""
         if not floor > 0:
             raise AssimilationError(f"the variance floor must be positive, got {floor}")
@@ -143,6 +144,7 @@ class Screened:
 
     @property
     def used(self) -> Tensor:
+        """`(*batch, m)` bool."""
         return self.reason == Reason.USED
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 import sys
 import traceback
+import warnings
 from collections.abc import Sequence
 
 __all__ = ["main"]
@@ -20,14 +21,13 @@ DEBUG = "TORCHSPH_TRACEBACK"
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code (argparse itself leaves with 2 by `SystemExit`)."""
-    from torchsph.simulator.schemes.presets import PRESETS
+    from .program import build_parser
 
-    from .arguments import build_parser
-    from .commands import COMMANDS
-
-    args = build_parser(COMMANDS, tuple(PRESETS)).parse_args(arguments)
+    args = build_parser().parse_args(arguments)
     try:
-        args.run(args)
+        with warnings.catch_warnings():
+            warnings.showwarning = _warn
+            args.run(args)
         sys.stdout.flush()
     except KeyboardInterrupt:
         return _fail(args.command, "interrupted", 130)
@@ -41,6 +41,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except Exception as error:
         return _fail(args.command, f"{type(error).__name__}: {error} ({DEBUG}=1 shows where)", 1)
     return 0
+
+
+def _warn(message: Warning | str, category: type[Warning], *_: object) -> None:
+    """One line for what the user should know; what is meant for programmers stays silent."""
+    if category is UserWarning:
+        print(f"torchsph: warning: {' '.join(str(message).split())}", file=sys.stderr)
 
 
 def _text(error: Exception) -> str:

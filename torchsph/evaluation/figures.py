@@ -18,10 +18,12 @@ import geometry
 
 matplotlib.use("Agg")  # no screen is needed, and none is asked for
 from matplotlib import pyplot as plt  # noqa: E402
-from matplotlib.collections import LineCollection  # noqa: E402
+from matplotlib.collections import LineCollection, QuadMesh  # noqa: E402
 
 from . import slices  # noqa: E402
-from .metrics import UNITS, Scores, filled_velocity, matching_frames  # noqa: E402
+from .frames import matching_frames  # noqa: E402
+from .metrics import UNITS, filled_velocity  # noqa: E402
+from .scores import Scores  # noqa: E402
 
 __all__ = ["characteristic_frames", "draw_forecast", "draw_report", "scores_table"]
 
@@ -64,7 +66,7 @@ def draw_report(
     rows = [Row(name, recording.select(frames)) for name, recording in named.items()]
     heights = [2.3 * len(rows), 2.5, 0.6 + 0.25 * len(scores)]
     figure = plt.figure(figsize=(9, sum(heights)), layout="constrained")
-    pictures, curves, table = figure.subfigures(3, 1, height_ratios=heights)
+    pictures, curves, table = np.asarray(figure.subfigures(3, 1, height_ratios=heights))
     _draw_cuts(pictures, rows, slices.valve_plane(measured))
     _draw_curves(curves.subplots(), measured, truth, scores)
     _draw_table(table.subplots(), scores, seconds or {})
@@ -102,7 +104,7 @@ def _cuts_of(recording: geometry.Recording, plane: slices.Plane, pixel: float) -
     return [slices.cut(recording, velocity[f], f, plane, pixel) for f in range(len(recording.time))]
 
 
-def _draw_cut(axis: matplotlib.axes.Axes, picture: slices.Cut, top: float, arrows: float):
+def _draw_cut(axis: matplotlib.axes.Axes, picture: slices.Cut, top: float, arrows: float) -> QuadMesh:
     mm = 1e3
     image = axis.pcolormesh(
         mm * picture.across,
@@ -126,7 +128,7 @@ def _draw_cut(axis: matplotlib.axes.Axes, picture: slices.Cut, top: float, arrow
         scale=8 * top,
         width=0.006,
     )
-    axis.add_collection(LineCollection(mm * picture.outline, colors="0.2", linewidths=1.0))
+    axis.add_collection(LineCollection(list(mm * picture.outline), colors="0.2", linewidths=1.0))
     axis.set_aspect("equal")
     axis.tick_params(labelsize=7)
     return image

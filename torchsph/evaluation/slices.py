@@ -9,7 +9,7 @@ import trimesh
 
 import geometry
 
-from .metrics import sample_inside
+from .boundary_flow import sample_inside
 
 __all__ = ["Cut", "Plane", "cut", "valve_plane"]
 
@@ -40,7 +40,7 @@ def valve_plane(recording: geometry.Recording) -> Plane:
 
     With fewer than two orifices the principal axes of the surface serve; a plane recording is its own plane.
     """
-    points = recording.wall.vertices.reshape(-1, recording.dimension)
+    points = _body(recording)
     if recording.dimension == 2:
         origin, across, along = np.zeros(2), np.array([1.0, 0.0]), np.array([0.0, 1.0])
     else:
@@ -50,10 +50,19 @@ def valve_plane(recording: geometry.Recording) -> Plane:
     return Plane(origin, across, along, (s.min() - margin, s.max() + margin, t.min() - margin, t.max() + margin))
 
 
+def _body(recording: geometry.Recording) -> np.ndarray:
+    """Points (n, D), m, of the wall at all frames; without a wall the nodes that are ever in the mask."""
+    if recording.wall is not None:
+        return recording.wall.vertices.reshape(-1, recording.dimension)
+    return recording.grid.nodes().numpy()[np.asarray(recording.mask, bool).any(axis=0).reshape(-1)]
+
+
 def _long_axis_plane(recording: geometry.Recording, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    surface = recording.wall.at(0)
-    labels = np.unique(surface.region[surface.region > 0])[:2]
-    centres = [surface.centroids[surface.part(label)].mean(0) for label in labels]
+    centres = []
+    if recording.wall is not None:
+        surface = recording.wall.at(0)
+        labels = np.unique(surface.region[surface.region > 0])[:2]
+        centres = [surface.centroids[surface.part(label)].mean(0) for label in labels]
     body = points.mean(0)
     principal = np.linalg.svd(points[:: max(1, len(points) // 5000)] - body, full_matrices=False)[2]
     across, upward = principal[1], principal[0]
@@ -78,13 +87,17 @@ def cut(recording: geometry.Recording, velocity: np.ndarray, frame: int, plane: 
     outline = _outline(recording, frame, plane)
     flat = points.reshape(-1, points.shape[-1])
     sampled, covered = sample_inside(recording.grid, velocity, recording.mask[frame], flat)
-    inside = covered & _enclosed(np.stack(np.meshgrid(s, t), -1).reshape(-1, 2), outline)
+    inside = covered
+    if recording.wall is not None:
+        inside = covered & _enclosed(np.stack(np.meshgrid(s, t), -1).reshape(-1, 2), outline)
     sampled = np.where(inside[:, None], sampled, np.nan).reshape(len(t), len(s), -1)
     in_plane = np.stack([sampled @ plane.across, sampled @ plane.along])
     return Cut(s, t, in_plane, np.linalg.norm(sampled, axis=-1), outline)
 
 
 def _outline(recording: geometry.Recording, frame: int, plane: Plane) -> np.ndarray:
+    if recording.wall is None:
+        return np.zeros((0, 2, 2))
     surface = recording.wall.at(frame)
     if recording.dimension == 2:
         segments = surface.vertices[surface.faces]

@@ -10,16 +10,15 @@ from typing import Any
 
 import geometry
 import regularize
-from torchsph.simulator.grid_forecast import ForecastSkill, skill
 from torchsph.simulator.scene import Scene
 from torchsph.simulator.schemes.presets import preset as scheme_preset
 from torchsph.simulator.simulator import Simulator
 
 from .ensemble.assimilate import assimilate
 from .ensemble.options import EnsembleOptions
-from .frame_splines import FrameSmoother, smooth_frames
+from .forecast_skill import ForecastSkill, skill
 from .free_run import run_freely
-from .measurement.error_model import estimate_error
+from .measurement.prepared import PreparedMeasurement
 from .nudging import filter_sph
 from .runtime.parallel import from_last, is_last, is_lead
 
@@ -83,51 +82,58 @@ def run_methods(
     Under torchrun all processes share the splines and the ensemble; the first one runs "sph" meanwhile and the last
     one "free". What the first one returns is complete.
 
-    Raises ValueError for an unknown method, and for "sph" on a measurement along a beam.
+    Raises:
+        ValueError: an unknown method, or "sph" on a measurement of components alone.
     """
-    unknown = [name for name in methods if name not in METHODS]
-    if unknown:
-        raise ValueError(f"unknown method {', '.join(unknown)}; known: {', '.join(METHODS)}")
-    if "sph" in methods and measured.beam is not None:
-        raise ValueError("method sph imposes full vectors and the measurement holds one component along a beam")
+    _check(methods, measured)
     if not methods:
         return {}
-    smoother = make_smoother(preset)
-    timer = _Timer()
-    splines = FrameSmoother(measured, smoother)
-    smoothed = smooth_frames(splines, progress)
+    smoother, timer = make_smoother(preset), _Timer()
+    prepared = PreparedMeasurement(measured, smoother, progress=progress)
+    smoothed = prepared.smoothed  # by all processes together
+    found = prepared.splines.estimates.summary()
+    mended = {"estimates": found} if found else {}
     results: dict[str, MethodResult] = {}
     if "spline" in methods:
-        results["spline"] = timer.result(smoothed, {"smoother": repr(smoother)})
+        results["spline"] = timer.result(smoothed, {"smoother": repr(smoother), **mended})
     spacing = ANALYSIS_SPACING * min(measured.grid.spacing) if spacing is None else spacing
     model = make_model(measured, preset=preset, spacing=spacing, device=device)
     if is_last() and set(methods) != {"spline"}:
-        free = run_freely(measured, model, smoothed.velocity[0], seed=seed, progress=progress)
-        results["free"] = timer.result(free, {})
+        results["free"] = timer.result(run_freely(measured, model, smoothed.velocity[0], seed=seed, progress=progress))
     if is_lead() and "sph" in methods:
-        error = estimate_error(measured, splines, smoothed)
-        run = filter_sph(measured, model, error=error, seed=seed, progress=progress)
+        run = filter_sph(prepared, model, seed=seed, progress=progress)
         results["sph"] = timer.result(run.recording, run.info)
     if "ensemble" in methods:
-        many = assimilate(
-            measured,
+        ensemble = assimilate(
+            prepared,
             make_model(measured, preset=preset, spacing=CONTROL_SHARE * spacing, device=device),
             coarse=model,
             members=DEFAULT_MEMBERS if members is None else members,
             options=EnsembleOptions(lag=lag),
             also=also,
-            splines=splines,
-            smoothed=smoothed,
             truth=truth,
             checkpoints=checkpoints,
             resume=resume,
             seed=seed,
             progress=progress,
         )
-        results["ensemble"] = timer.result(many.recording, many.info)
+        results["ensemble"] = timer.result(ensemble.recording, ensemble.info | mended)
+    return _collected(results)
+
+
+def _check(methods: Sequence[str], measured: geometry.Recording) -> None:
+    unknown = [name for name in methods if name not in METHODS]
+    if unknown:
+        raise ValueError(f"unknown method {', '.join(unknown)}; known: {', '.join(METHODS)}")
+    if "sph" in methods:
+        geometry.measurement_type(measured).require_full("method sph imposes")
+
+
+def _collected(results: dict[str, MethodResult]) -> dict[str, MethodResult]:
+    """In the order of ``METHODS``, "free" from the process that ran it."""
     free = from_last(results.get("free"))
-    results |= {} if free is None else {"free": free}
-    return {name: results[name] for name in METHODS if name in results}
+    known = results if free is None else results | {"free": free}
+    return {name: known[name] for name in METHODS if name in known}
 
 
 class _Timer:
@@ -136,10 +142,10 @@ class _Timer:
     def __init__(self) -> None:
         self.began = clock.perf_counter()
 
-    def result(self, recording: geometry.Recording, info: dict[str, Any]) -> MethodResult:
-        now = clock.perf_counter()
-        seconds, self.began = now - self.began, now
-        return MethodResult(recording, seconds, info)
+    def result(self, recording: geometry.Recording, info: dict[str, Any] | None = None) -> MethodResult:
+        ended = clock.perf_counter()
+        seconds, self.began = ended - self.began, ended
+        return MethodResult(recording, seconds, {} if info is None else info)
 
 
 def forecast_skill(
@@ -154,7 +160,7 @@ def forecast_skill(
     progress: bool = False,
     seed: int = 0,
 ) -> ForecastSkill:
-    """Skill of the simulator on a recording; see ``forecast.skill``. ``spacing`` (m) defaults to the grid's."""
+    """Skill of the simulator on a recording; see ``skill``. ``spacing`` (m) defaults to the grid's."""
     began = clock.perf_counter()
     model = make_model(recording, preset=preset, spacing=spacing, device=device)
     made = clock.perf_counter() - began

@@ -1,4 +1,4 @@
-"""The thesis's filter: one simulator runs along, each measured frame is imposed on it, the grid is fetched."""
+"""Nudging: one simulator runs along, each measured frame is imposed on it, the grid is fetched."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from torch import Tensor
 from tqdm import tqdm
 
 import geometry
-import regularize
 from torchsph.simulator.simulator import Simulation, Simulator
 
-from .frame_splines import FrameSmoother, node_weights, smooth_frames
-from .measurement.error_model import ObservationError, estimate_error
+from .measurement.error_model import ObservationError
+from .measurement.frame_splines import node_weights
+from .measurement.prepared import PreparedMeasurement
 
 # share of the innovation's variance that the forecast keeps for itself at least: it is never believed blindly
 _LEAST_FORECAST_SHARE = 0.05
@@ -29,28 +29,33 @@ class FilteredRun:
 
 
 def filter_sph(
-    measured: geometry.Recording,
+    measured: geometry.Recording | PreparedMeasurement,
     model: Simulator,
     *,
-    error: ObservationError | None = None,
     seed: int = 0,
     progress: bool = False,
 ) -> FilteredRun:
-    """Run one simulator through a recording and impose each frame on the running particles (thesis 3.1.6).
+    """Run one simulator through a recording and impose each frame on the running particles (Grønli 2017, sec. 3.1.6).
 
     A particle's velocity v becomes  v + K (u - v)  with the measured u at its place (moving least squares over the
     nodes, weighted by their confidence) and  K = P / (P + R):  R the measurement's error variance there, P the
     forecast's, estimated at every frame from the innovations (their variance exceeds R by P).
 
     Args:
-        measured: the recording. model: simulator of its scene. error: the measurement's error model (None: estimated).
+        measured: the recording, prepared or not.
+        model: simulator of its scene.
+        seed: of everything random.
+        progress: show a bar.
 
     Returns:
         The fetched grid after each frame's update, on the measurement's grid, mask and times.
+
+    Raises:
+        ValueError: the measurement does not hold full vectors.
     """
-    if error is None:
-        splines = FrameSmoother(measured, regularize.Smoother())
-        error = estimate_error(measured, splines, smooth_frames(splines, progress))
+    prepared = PreparedMeasurement.of(measured, progress=progress)
+    prepared.type.require_full("method sph imposes")
+    measured, error = prepared.recording, prepared.error
     run = model.start(float(measured.time[0]), seed=seed)
     fields, missing = [], []
     frames = tqdm(range(measured.frames), desc="sph", unit="frame", disable=None if progress else True)

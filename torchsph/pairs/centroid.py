@@ -16,7 +16,7 @@ def centroid_xsph(state: PairState, support: Support, cell: float, period: Tenso
     """sum over own and adjacent cells c of V_c (v_c - v_a) W(|x_a - X_c|), (N, D), any device.
 
     V_c is the volume and v_c the mass-weighted mean velocity of the particles in a cell, X_c its middle
-    (Gronli 2017 section 5.2; the full form is ``RateTerms.xsph``). Costs 3^D evaluations a particle.
+    (Grønli 2017, sec. 5.2; the full form is ``RateTerms.xsph``). Costs 3^D evaluations a particle.
 
     Args:
         cell: edge of the cells; on a periodic axis it is widened so that whole cells fill the period. Cells

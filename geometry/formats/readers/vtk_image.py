@@ -57,7 +57,8 @@ def open_vtkhdf(path: Path) -> Source:
         raise FormatError(f"{path}: holds VTKHDF {text(root.attrs.get('Type', ''))}, and ImageData is needed")
     arrays = datasets(root["PointData"]) if "PointData" in root else {}
     steps = root.get("Steps")
-    time = None if steps is None else np.asarray(steps["Values"][()], np.float64)
+    stamp = root.get("FieldData/TimeValue") if steps is None else steps["Values"]
+    time = None if stamp is None else np.asarray(stamp[()], np.float64).reshape(-1)
     extent = np.asarray(root.attrs["WholeExtent"])
     space, axes = "yx" if extent[4] == extent[5] else "zyx", {}
     for name, node in arrays.items():

@@ -70,8 +70,9 @@ class PolySeries:
         root.attrs["Version"] = np.array([2, 0], np.int64)
         root.attrs.create("Type", np.bytes_("PolyData"))
         self._root, self._steps = root, root.create_group("Steps")
-        self._count = self._points = 0
-        self._topology: tuple[str, np.ndarray] | None = None
+        self._count = self._parts = self._nodes = 0
+        self._cells: np.ndarray | None = None
+        self._starts: dict[str, list[int]] = {}
 
     def __enter__(self) -> PolySeries:
         return self
@@ -99,35 +100,45 @@ class PolySeries:
             time: s.
             points: (n, D), m.
             cells: (m, 3) triangles or (m, 2) lines of point numbers; None makes a vertex of every point.
-            point_data, cell_data: by name, (n, ...) and (m, ...); the same names at every time.
+            point_data: by name, (n, ...); the same names at every time.
+            cell_data: by name, (m, ...); the same names at every time.
         """
         place = np.zeros((len(points), 3))
         place[:, : points.shape[1]] = points
         cells = np.arange(len(points))[:, None] if cells is None else np.asarray(cells)
-        kind = {1: "Vertices", 2: "Lines", 3: "Polygons"}[cells.shape[1]]
-        starts = {name: self._length(f"{name}/Connectivity") for name in TOPOLOGIES}
-        cell_starts = {name: self._length(f"{name}/Offsets") - self._count for name in TOPOLOGIES}
+        if self._cells is None or not (len(points) == self._nodes and np.array_equal(cells, self._cells)):
+            self._new_part(cells, len(points))
         _grow(self._steps, "Values", np.array([time]))
-        _grow(self._steps, "PartOffsets", np.array([self._count], np.int64))
+        _grow(self._steps, "PartOffsets", np.array([self._parts - 1], np.int64))
         _grow(self._steps, "NumberOfParts", np.array([1], np.int64))
-        _grow(self._steps, "PointOffsets", np.array([self._points], np.int64))
-        _grow(self._steps, "CellOffsets", np.array([[cell_starts[name] for name in TOPOLOGIES]], np.int64))
-        _grow(self._steps, "ConnectivityIdOffsets", np.array([[starts[name] for name in TOPOLOGIES]], np.int64))
-        _grow(self._root, "NumberOfPoints", np.array([len(points)], np.int64))
+        _grow(self._steps, "PointOffsets", np.array([self._length("Points")], np.int64))
+        for name in ("CellOffsets", "ConnectivityIdOffsets"):
+            _grow(self._steps, name, np.array([self._starts[name]], np.int64))
         _grow(self._root, "Points", place)
-        for name in TOPOLOGIES:
-            chosen = cells if name == kind else cells[:0]
-            _grow(self._root, f"{name}/NumberOfCells", np.array([len(chosen)], np.int64))
-            _grow(self._root, f"{name}/NumberOfConnectivityIds", np.array([chosen.size], np.int64))
-            _grow(self._root, f"{name}/Offsets", cells.shape[1] * np.arange(len(chosen) + 1, dtype=np.int64))
-            _grow(self._root, f"{name}/Connectivity", chosen.ravel().astype(np.int64))
         for group, data in (("PointData", point_data), ("CellData", cell_data)):
             for name, values in (data or {}).items():
                 values = _three(np.asarray(values))
                 _grow(self._steps, f"{group}Offsets/{name}", np.array([self._length(f"{group}/{name}")], np.int64))
                 _grow(self._root, f"{group}/{name}", values)
         self._count += 1
-        self._points += len(points)
+
+    def _new_part(self, cells: np.ndarray, nodes: int) -> None:
+        """Store cells that differ from those of the time before; times of the same cells share them."""
+        kind = {1: "Vertices", 2: "Lines", 3: "Polygons"}[cells.shape[1]]
+        # A part has one offset more than cells, which the reader adds by itself.
+        self._starts = {
+            "CellOffsets": [self._length(f"{name}/Offsets") - self._parts for name in TOPOLOGIES],
+            "ConnectivityIdOffsets": [self._length(f"{name}/Connectivity") for name in TOPOLOGIES],
+        }
+        _grow(self._root, "NumberOfPoints", np.array([nodes], np.int64))
+        for name in TOPOLOGIES:
+            chosen = cells if name == kind else cells[:0]
+            _grow(self._root, f"{name}/NumberOfCells", np.array([len(chosen)], np.int64))
+            _grow(self._root, f"{name}/NumberOfConnectivityIds", np.array([chosen.size], np.int64))
+            _grow(self._root, f"{name}/Offsets", cells.shape[1] * np.arange(len(chosen) + 1, dtype=np.int64))
+            _grow(self._root, f"{name}/Connectivity", chosen.ravel().astype(np.int64))
+        self._cells, self._nodes = cells.copy(), nodes
+        self._parts += 1
 
     def _length(self, name: str) -> int:
         return len(self._root[name]) if name in self._root else 0
@@ -143,7 +154,8 @@ def _three(values: np.ndarray) -> np.ndarray:
 def _grow(group: h5py.Group, name: str, values: np.ndarray) -> None:
     if name not in group:
         chunk = (max(1, min(len(values) or 1, 65536)), *values.shape[1:])
-        group.create_dataset(name, data=values, maxshape=(None, *values.shape[1:]), chunks=chunk)
+        options = {"compression": "gzip", "shuffle": True} if len(values) > 16 else {}
+        group.create_dataset(name, data=values, maxshape=(None, *values.shape[1:]), chunks=chunk, **options)
         return
     node = group[name]
     node.resize(len(node) + len(values), axis=0)
@@ -163,6 +175,9 @@ def _image(file: h5py.File, recording: Recording) -> h5py.Group:
 
 
 def _steps(root: h5py.Group, time: np.ndarray, names: list[str]) -> None:
+    if len(time) == 1:
+        root.create_group("FieldData")["TimeValue"] = np.asarray(time, np.float64)
+        return
     steps = root.create_group("Steps")
     steps.attrs["NSteps"] = np.int64(len(time))
     steps["Values"] = np.asarray(time, np.float64)
@@ -174,7 +189,10 @@ def _steps(root: h5py.Group, time: np.ndarray, names: list[str]) -> None:
 def _store(points: h5py.Group, name: str, values: np.ndarray, dimension: int) -> None:
     """One chunk a frame, compressed; VTK wants a plane's arrays without the axis of its single layer."""
     values = values[:, 0] if dimension == 2 else values
-    points.create_dataset(name, data=values, chunks=(1, *values.shape[1:]), compression="gzip", shuffle=True)
+    chunk = (1, *values.shape[1:])
+    if len(values) == 1:  # a single time has no axis of times in VTK's eyes
+        values, chunk = values[0], values.shape[1:]
+    points.create_dataset(name, data=values, chunks=chunk, compression="gzip", shuffle=True)
 
 
 def _virtual(points: h5py.Group, name: str, node: h5py.Dataset, recording: Recording, file: str) -> None:
@@ -183,6 +201,15 @@ def _virtual(points: h5py.Group, name: str, node: h5py.Dataset, recording: Recor
     source = h5py.VirtualSource(file, f"/{name}", shape=node.shape, dtype=node.dtype)
     still = node.ndim == recording.dimension + is_vector
     layout = h5py.VirtualLayout((*shape, 3) if is_vector else shape, node.dtype)
+    if recording.frames == 1:  # a single time has no axis of times in VTK's eyes
+        layout = h5py.VirtualLayout(layout.shape[1:], node.dtype)
+        whole = () if still else (0,)
+        if not is_vector:
+            layout[...] = source[(*whole, ...)]
+        for component in range(recording.dimension if is_vector else 0):
+            layout[..., component] = source[(*whole, component)]
+        points.create_virtual_dataset(name, layout, fillvalue=0)
+        return
     for frame in range(recording.frames) if still else [slice(None)]:
         if not is_vector:
             layout[frame] = source if still else source[...]

@@ -103,6 +103,25 @@ def test_vtkhdf_is_converted_back(recording: Recording, tmp_path: Path) -> None:
     np.testing.assert_array_equal(result.recording.weight, recording.weight)
 
 
+@pytest.mark.parametrize("way", ["export", "sidecar"])
+def test_a_single_frame_opens_in_vtk(recording: Recording, tmp_path: Path, way: str) -> None:
+    """VTK expects no axis of times where there is one time."""
+    pytest.importorskip("vtk", reason=EXTRA)
+    from vtkmodules.vtkIOHDF import vtkHDFReader
+
+    single = recording.select([1])
+    write_recording(tmp_path / "s.h5", single)
+    files = export(single, tmp_path / "t", "vtkhdf") if way == "export" else write_sidecar(tmp_path / "s.h5")
+    for file, expected in zip(files, (single.velocity[0].reshape(3, -1).T, single.wall.velocity[0]), strict=True):
+        reader = vtkHDFReader()
+        reader.SetFileName(str(file))
+        reader.Update()
+        _, velocity = image_at(reader, single.time[0])
+        np.testing.assert_allclose(velocity, expected, atol=1e-9)
+    if way == "export":
+        same(single, convert(files[:1], FieldMap(length_unit="m", mask="mask")).recording)
+
+
 def test_a_plane_recording_opens_in_vtk(box_recording: Callable[..., Recording], tmp_path: Path) -> None:
     pytest.importorskip("vtk", reason=EXTRA)
     from vtkmodules.vtkIOHDF import vtkHDFReader

@@ -3,11 +3,10 @@
 import numpy as np
 import pytest
 import torch
+from regularize_cases import smoother
 from scipy.ndimage import gaussian_filter
 
-from regularize import Smoother
-
-PLAIN = Smoother(correlated=False)  # the fit as for independent errors
+PLAIN = smoother(correlated=False)  # the fit as for independent errors
 NODES, STEP = 16, 1e-3  # per axis, m
 LEVEL = (0.1, 0.1, 0.04)  # m/s
 
@@ -69,7 +68,7 @@ def test_shared_errors_weigh_less_in_the_fit():
     for seed in (0, 1):
         measured = flow(grid()) + noise(3.0, seed)
         plain.append((PLAIN.fit(grid(), measured)(grid()) - flow(grid()))[INNER])
-        field = Smoother().fit(grid(), measured, uncertainty=True)
+        field = smoother().fit(grid(), measured, uncertainty=True)
         counted.append((field(grid()) - flow(grid()))[INNER])
         score.append(counted[-1] / field.std(grid())[INNER])
         assert min(field.choice.shared) > 1.2
@@ -80,6 +79,6 @@ def test_the_inflation_follows_the_data_and_not_their_units():
     points = grid()
     measured = flow(points) + noise(3.0, 5)
     inflation = PLAIN.fit(points, measured, uncertainty=True).posterior.inflation
-    scaled = Smoother(knots=30e-3, divergence=0.3, curvature=10e-3, correlated=False)
+    scaled = smoother(knots=30e-3, divergence=0.3, curvature=10e-3, correlated=False)
     again = scaled.fit(10 * points, measured, uncertainty=True).posterior.inflation
     assert float(inflation.min()) > 1.2 and torch.allclose(inflation, again, rtol=0.02)

@@ -2,10 +2,11 @@
 
 import pytest
 import torch
-from regularize_cases import blocks_of
+from regularize_cases import blocks_of, smoother
 
-from regularize import BlockFactor, InvalidInput, Posterior, PreparedSystem, Smoother, System, solve_direct
-from regularize.smoothing.row_blocks import build_system, knots_for
+from regularize import BlockFactor, InvalidInput, Posterior, PreparedSystem, System, solve_direct
+from regularize.smoothing.knot_grid import knots_for
+from regularize.smoothing.row_blocks import build_system
 from regularize.smoothing.samples import FitData
 
 SMALL = {"automatic": None, "robust": None}
@@ -52,7 +53,7 @@ def test_z_scores_on_data_simulated_from_the_model():
     """Fields drawn from the prior, noisy samples of them: (fit - truth) / std has standard deviation 1."""
     generator = torch.Generator().manual_seed(0)
     points = torch.rand(800, 3, generator=generator, dtype=torch.float64) * 15e-3
-    options = Smoother(divergence=5e-3, curvature=1.5e-3, damping=0.05, wall=None, no_slip=None, **SMALL)
+    options = smoother(divergence=5e-3, curvature=1.5e-3, damping=0.05, wall=None, no_slip=None, **SMALL)
     z = []
     for exact, measured in simulated(options, points, 0.2, 6, generator):
         field = options.fit(points, measured, uncertainty=True)
@@ -65,9 +66,9 @@ def test_the_likelihood_recovers_noise_curvature_and_divergence_of_simulated_dat
     generator = torch.Generator().manual_seed(0)
     points = torch.rand(2000, 3, generator=generator, dtype=torch.float64) * 17e-3
     same = {"damping": 0.05, "wall": None, "no_slip": None, "robust": None}
-    truth = Smoother(divergence=divergence, curvature=0.6e-3, automatic=None, **same)
+    truth = smoother(divergence=divergence, curvature=0.6e-3, automatic=None, **same)
     ((_, measured),) = simulated(truth, points, 0.05, 1, generator)
-    blind = Smoother(choose_divergence=True, search_knots=1.0, rounds=30, **same)  # starts from the defaults
+    blind = smoother(choose_divergence=True, search_knots=1.0, rounds=30, **same)  # starts from the defaults
     choice = blind.fit(points, measured).choice
     assert choice.settled and choice.noise == pytest.approx((0.05,) * 3, rel=0.1)
     assert choice.curvature == pytest.approx(0.6e-3, rel=0.05)
@@ -84,7 +85,7 @@ def test_z_scores_with_everything_chosen_from_the_data():
     measured = exact + level * torch.randn(exact.shape, generator=generator, dtype=torch.float64)
     hops = torch.rand(3000, generator=generator) < 0.02
     measured[hops] += 5.0
-    field = Smoother().fit(points, measured, uncertainty=True)
+    field = smoother().fit(points, measured, uncertainty=True)
     assert torch.allclose(torch.tensor(field.choice.noise).double(), level, rtol=0.15)
     assert float(field.choice.robust[hops].max()) == 0 and float(field.choice.robust[~hops].mean()) > 0.8
     inner = ((points > 3e-3) & (points < 17e-3)).all(1)
@@ -103,7 +104,7 @@ def test_z_scores_of_a_blurred_measurement_need_its_blur():
     blur = 4e-3
     damped = exact * float(torch.exp(torch.tensor(-0.5 * (wave * blur / 2.3548) ** 2)))
     noise = 0.1 * torch.randn(exact.shape, generator=generator, dtype=torch.float64)
-    field = Smoother(robust=None).fit(points, damped + noise, uncertainty=True)
+    field = smoother(robust=None).fit(points, damped + noise, uncertainty=True)
     inner = ((points > 2e-3) & (points < 13e-3)).all(1)
     off = (field(points) - exact)[inner]
     assert float((off / field.std(points)[inner]).square().mean().sqrt()) > 5
@@ -112,7 +113,7 @@ def test_z_scores_of_a_blurred_measurement_need_its_blur():
 
 def test_laplacian_equals_autodiff():
     where = torch.rand(200, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64) * 1e-2
-    field, points = Smoother(knots=4e-3, **SMALL).fit(where, torch.sin(300 * where)), where.clone().requires_grad_()
+    field, points = smoother(knots=4e-3, **SMALL).fit(where, torch.sin(300 * where)), where.clone().requires_grad_()
     total = torch.zeros(200, 3, dtype=torch.float64)
     for k in range(3):
         (first,) = torch.autograd.grad(field(points)[:, k].sum(), points, create_graph=True)
@@ -123,7 +124,7 @@ def test_laplacian_equals_autodiff():
 
 def test_std_needs_a_posterior_and_is_masked():
     points = torch.rand(100, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64) * 1e-2
-    options = Smoother(**SMALL)
+    options = smoother(**SMALL)
     with pytest.raises(InvalidInput, match="uncertainty"):
         options.fit(points, points).std(points)
     field = options.fit(points, points, uncertainty=True)
@@ -131,7 +132,7 @@ def test_std_needs_a_posterior_and_is_masked():
     with pytest.raises(InvalidInput, match="blur"):
         field.std(points, blur=-1e-3)
     with pytest.raises(InvalidInput, match="uncertainty"):
-        Smoother(solver="lsqr", divergence=None, **SMALL).fit(points, points, uncertainty=True)
+        smoother(solver="lsqr", divergence=None, **SMALL).fit(points, points, uncertainty=True)
 
 
 def test_cross_validation_finds_the_best_curvature_on_white_noise():
@@ -140,7 +141,7 @@ def test_cross_validation_finds_the_best_curvature_on_white_noise():
     x, y = (300 * points).unbind(1)
     exact = torch.stack([torch.sin(y) + torch.cos(2 * y), torch.sin(2 * x)], dim=1)
     measured = exact + 0.5 * torch.randn(3000, 2, generator=generator, dtype=torch.float64)
-    options = Smoother(knots=2e-3, automatic="gcv", robust=None, search_knots=1.0)
+    options = smoother(knots=2e-3, automatic="gcv", robust=None, search_knots=1.0)
     chosen = options.fit(points, measured)
     assert chosen.choice.noise == pytest.approx((0.5, 0.5), rel=0.05)
 
@@ -150,6 +151,6 @@ def test_cross_validation_finds_the_best_curvature_on_white_noise():
     best = min(error(chosen.choice.curvature * 2.0**k) for k in (-2, -1, -0.5, 0, 0.5, 1, 2))
     assert error(chosen.choice.curvature) < 1.05 * best
     measured[:60] += 20.0
-    robust = Smoother(knots=2e-3, automatic="gcv").fit(points, measured)
+    robust = smoother(knots=2e-3, automatic="gcv").fit(points, measured)
     assert float(robust.choice.robust[:60].max()) == 0
     assert float((robust(points) - exact).norm()) < 1.3 * best

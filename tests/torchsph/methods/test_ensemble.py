@@ -1,5 +1,6 @@
 """The ensemble cycle and what it rests on: perturbations, the error model, determinism, a gain over the raw data."""
 
+import dataclasses
 from dataclasses import replace
 
 import numpy as np
@@ -9,12 +10,12 @@ import torch
 import geometry
 from geometry.grids.fields import fwhm_to_deviation, smooth_noise
 from regularize import Smoother
-from torchsph import EnsembleOptions, Simulator, assimilate, estimate_error, filter_sph, preset
+from torchsph import EnsembleOptions, PreparedMeasurement, Simulator, assimilate, estimate_error, filter_sph, preset
 from torchsph.data import sample_measurement, sample_truth
 from torchsph.methods.ensemble.model_error import flow_perturbations
-from torchsph.methods.frame_splines import FrameSmoother, node_weights, smooth_frames
 from torchsph.methods.measurement.error_model import kernel_width
-from torchsph.methods.wall_rows import flux_shares, open_regions, wall_rows
+from torchsph.methods.measurement.frame_splines import FrameSmoother, node_weights, smooth_frames
+from torchsph.methods.measurement.wall_rows import open_regions, wall_rows
 from torchsph.simulator.scene import Scene
 
 
@@ -30,13 +31,18 @@ def truth(measured):
 
 
 @pytest.fixture(scope="module")
-def splines(measured):
-    return FrameSmoother(measured, Smoother())
+def prepared(measured):
+    return PreparedMeasurement(measured)
 
 
 @pytest.fixture(scope="module")
-def smoothed(splines):
-    return smooth_frames(splines)
+def splines(prepared):
+    return prepared.splines
+
+
+@pytest.fixture(scope="module")
+def smoothed(prepared):
+    return prepared.smoothed
 
 
 @pytest.fixture(scope="module")
@@ -87,10 +93,16 @@ def test_wall_rows_carry_the_flux_of_the_open_valve(measured):
     assert float(wall_rows(measured, motion, 1, at_rest=True).velocity.abs().max()) == 0.0
 
 
-def test_flux_fills_through_the_first_and_empties_through_the_last_valve():
-    assert flux_shares((1, 2), 3.0) == {1: 3.0, 2: 0.0}
-    assert flux_shares((1, 2), -3.0) == {1: 0.0, 2: -3.0}
-    assert flux_shares((), 3.0) == {}
+def test_openings_that_are_open_together_have_no_rows_and_the_shut_wall_keeps_all(measured):
+    """How they share dV/dt is for the data to say."""
+    both = dataclasses.replace(measured, valve_intervals=np.array([[1.0, -1.0, 9.0], [2.0, -1.0, 9.0]]))
+    motion = geometry.WallMotion.from_recording(both)
+    rows = wall_rows(both, motion, 1)
+    assert open_regions(both, float(both.time[1])) == (1, 2)
+    surface = motion.surface(float(both.time[1]))
+    assert bool(rows.no_slip.all()) and float(rows.weight.sum()) == pytest.approx(
+        float(surface.areas[surface.region == 0].sum())
+    )
 
 
 def test_error_model_finds_white_noise(measured, smoothed):
@@ -116,17 +128,17 @@ def test_missing_velocities_have_no_weight(measured):
     assert weights[measured.mask[0]].sum() == measured.mask[0].sum() - 1
 
 
-def test_ensemble_and_particle_filter_stay_well_below_raw(measured, truth, model, splines, smoothed):
+def test_ensemble_and_nudging_stay_well_below_raw(measured, truth, model, prepared):
     raw = nrmse(np.nan_to_num(measured.velocity), truth, measured.mask)
-    run = assimilate(measured, model, members=4, splines=splines, smoothed=smoothed, seed=1)
+    run = assimilate(prepared, model, members=4, seed=1)
     geometry.check_recording(run.recording, "ensemble")
     assert nrmse(run.recording.velocity, truth, measured.mask) < 0.5 * raw
     assert run.recording.sigma is not None
     inside = np.moveaxis(run.recording.sigma, 1, -1)[measured.mask]
     assert (inside > 0).mean() > 0.99
-    again = assimilate(measured, model, members=4, splines=splines, smoothed=smoothed, seed=1)
+    again = assimilate(prepared, model, members=4, seed=1)
     np.testing.assert_array_equal(again.recording.velocity, run.recording.velocity)
-    particles = filter_sph(measured, model, error=estimate_error(measured, splines, smoothed), seed=1)
+    particles = filter_sph(prepared, model, seed=1)
     geometry.check_recording(particles.recording, "sph")
     assert nrmse(particles.recording.velocity, truth, measured.mask) < 0.8 * raw
 

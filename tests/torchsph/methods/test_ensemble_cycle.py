@@ -10,15 +10,13 @@ import torch.multiprocessing as multiprocessing
 
 import geometry
 import torchsph
-from regularize import Smoother
-from torchsph import EnsembleOptions, Estimated, Simulator, assimilate, estimate_error, preset
+from torchsph import EnsembleOptions, Estimated, PreparedMeasurement, Simulator, assimilate, estimate_error, preset
 from torchsph.assimilation import Parameter
 from torchsph.data import sample_measurement, sample_truth
 from torchsph.methods.ensemble.cycle import Cycle
 from torchsph.methods.ensemble.divergence_cleaning import Cleaned
 from torchsph.methods.ensemble.forecaster import Ensemble, Forecaster
-from torchsph.methods.frame_splines import FrameSmoother, smooth_frames
-from torchsph.methods.measurement.observation_operator import Source
+from torchsph.methods.measurement.observation_operator import Measurement
 from torchsph.simulator.scene import Scene
 
 FRAMES = slice(10, 14)
@@ -35,15 +33,13 @@ class Given:
 
     def __init__(self) -> None:
         self.measured = geometry.read_recording(sample_measurement()).select(FRAMES)
-        self.splines = FrameSmoother(self.measured, Smoother())
-        self.smoothed = smooth_frames(self.splines)
-        self.error = estimate_error(self.measured, self.splines, self.smoothed)
+        self.prepared = PreparedMeasurement(self.measured)
+        self.smoothed = self.prepared.smoothed
         self.model = made_model(self.measured)
 
     def run(self, **more):
-        known = {"splines": self.splines, "smoothed": self.smoothed, "error": self.error, "members": 3, "seed": 1}
-        known["options"] = EnsembleOptions(batch=2)
-        return assimilate(self.measured, self.model, **known | more)
+        known = {"members": 3, "seed": 1, "options": EnsembleOptions(batch=2)}
+        return assimilate(self.prepared, self.model, **known | more)
 
 
 @pytest.fixture(scope="module")
@@ -152,12 +148,11 @@ def silenced(measured, frames):
 )
 def test_frames_without_data_are_forecast(given, frames):
     measured = silenced(given.measured, frames)
-    splines = FrameSmoother(measured, Smoother())
     if len(frames) == measured.frames:
         with pytest.raises(ValueError, match="no node with a positive weight"):
-            assimilate(measured, given.model, members=2, splines=splines)
+            assimilate(measured, given.model, members=2)
         return
-    run = assimilate(measured, given.model, members=2, splines=splines, seed=1)
+    run = assimilate(measured, given.model, members=2, seed=1)
     geometry.check_recording(run.recording, "ensemble")
     assert run.info["coasted_frames"] == len([f for f in frames if f > 0])
     counts = run.info["filter"]["cycles"]
@@ -171,9 +166,7 @@ def test_frames_without_data_are_forecast(given, frames):
 def test_ten_frames_without_data_are_forecast_and_their_uncertainty_grows():
     every = geometry.read_recording(sample_measurement()).select(slice(2, 15))
     measured = silenced(every, list(range(1, 11)))
-    splines = FrameSmoother(measured, Smoother())
-    smoothed = smooth_frames(splines)
-    run = assimilate(measured, made_model(measured), members=2, splines=splines, smoothed=smoothed, seed=1)
+    run = assimilate(measured, made_model(measured), members=2, seed=1)
     assert run.info["coasted_frames"] == 10
     assert any(
         "no observation was used in this cycle" in words and "10 of 12" in words
@@ -220,7 +213,7 @@ def test_an_analysis_whose_divergence_stays_is_counted_and_warned_of(given, monk
     def failing(velocity, mask, spacing):
         return Cleaned(velocity, 1.0, False)
 
-    monkeypatch.setattr("torchsph.methods.ensemble.cycle.without_divergence", failing)
+    monkeypatch.setattr("torchsph.methods.ensemble.analyses.without_divergence", failing)
     with pytest.warns(RuntimeWarning, match="divergence did not converge in 4 analyses"):
         run = given.run(members=2)
     assert run.info["divergence_not_converged"] == 4
@@ -250,20 +243,17 @@ def along_z(measured):
 @pytest.mark.slow
 def test_one_component_alone_beats_its_spline(given):
     doppler = along_z(given.measured)
-    splines = FrameSmoother(doppler, Smoother())
-    smoothed = smooth_frames(splines)
-    fine = made_model(doppler, FINE)
-    run = assimilate(doppler, fine, coarse=given.model, members=3, splines=splines, smoothed=smoothed, seed=1)
+    prepared, fine = PreparedMeasurement(doppler), made_model(doppler, FINE)
+    run = assimilate(prepared, fine, coarse=given.model, members=3, seed=1)
     assert run.recording.beam is None
-    assert nrmse(run.recording) < nrmse(smoothed)
+    assert nrmse(run.recording) < nrmse(prepared.smoothed)
 
 
 @pytest.mark.slow  # half a minute
 def test_a_second_measurement_of_other_grid_and_times_helps(given):
     """The truth of every other node, seen along z every 5 ms, almost without noise."""
     fine = made_model(given.measured, FINE)
-    known = {"splines": given.splines, "smoothed": given.smoothed, "error": given.error, "coarse": given.model}
-    plain = assimilate(given.measured, fine, members=3, **known)
+    plain = assimilate(given.prepared, fine, coarse=given.model, members=3)
     every = geometry.read_recording(sample_truth())
     near = every.select((every.time > given.measured.time[0]) & (every.time < given.measured.time[-1] + 1e-6))
     grid = near.grid
@@ -278,7 +268,7 @@ def test_a_second_measurement_of_other_grid_and_times_helps(given):
             sigma=np.full((near.frames, 3, *shape), 0.01, np.float32),
         )
     )
-    both = assimilate(given.measured, fine, members=3, also=[thin], **known)
+    both = assimilate(given.prepared, fine, coarse=given.model, members=3, also=[thin])
     used = both.info["filter"]["observations"]["used"]
     assert used > plain.info["filter"]["observations"]["used"] + 1000
     assert len(both.info["observation_error_scale"]) == 4
@@ -318,9 +308,9 @@ def test_an_estimated_parameter_stays_in_its_bounds_and_moves(given):
 def test_observations_noisier_than_said_are_noticed(given, fine):
     """The file claims a tenth of the errors, or less; with a forecast of some worth the claim costs nothing."""
     told = replace(given.measured, sigma=np.full_like(given.measured.velocity, 0.004))
-    splines = FrameSmoother(told, Smoother())
+    prepared = PreparedMeasurement(told, smoothed=given.smoothed)
     model = made_model(told, FINE) if fine else given.model
-    run = assimilate(told, model, coarse=given.model, members=3, splines=splines, smoothed=given.smoothed, seed=1)
+    run = assimilate(prepared, model, coarse=given.model, members=3, seed=1)
     assert min(run.info["observation_error_scale"]) > 4.0
     words = run.info["filter"]["warnings"]
     assert any("overconfident" in each for each in words)
@@ -333,9 +323,10 @@ def test_an_observation_that_claims_to_be_exact_is_refused_by_name(given):
     sigma = np.full_like(given.measured.velocity, 0.05)
     sigma[1] = 0.0
     told = replace(given.measured, sigma=sigma)
-    source = Source(told, estimate_error(told, given.splines, given.smoothed), told.grid)
+    error = estimate_error(told, given.prepared.splines, given.smoothed)
+    measurement = Measurement(PreparedMeasurement(told, error=error), told.grid)
     with pytest.raises(ValueError, match="zero or negative, which makes the gain singular"):
-        source.see(1)
+        measurement.see(1)
 
 
 @pytest.mark.slow
@@ -345,10 +336,9 @@ def test_irregular_frames_and_a_valve_that_opens_between_them(given):
     assert np.ptp(np.diff(measured.time)) > 0.015
     opening = measured.valve_intervals_or_derived()[:, 1]
     assert ((opening > measured.time[1]) & (opening < measured.time[2])).any()
-    splines = FrameSmoother(measured, Smoother())
-    smoothed = smooth_frames(splines)
-    run = assimilate(measured, made_model(measured), members=2, splines=splines, smoothed=smoothed)
-    assert nrmse(run.recording) < nrmse(smoothed)
+    prepared = PreparedMeasurement(measured)
+    run = assimilate(prepared, made_model(measured), members=2)
+    assert nrmse(run.recording) < nrmse(prepared.smoothed)
 
 
 def test_the_names_are_exported():

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 import geometry
-from torchsph import EnsembleOptions, Estimated, Simulator, assimilate, preset
+from torchsph import EnsembleOptions, Estimated, PreparedMeasurement, Simulator, assimilate, preset
 from torchsph.assimilation import Parameter
 from torchsph.data import sample_measurement
 from torchsph.methods.measurement.error_model import ObservationError
@@ -63,7 +63,8 @@ def test_valve_strength_and_viscosity_are_found_together(strength, viscosity):
     error = ObservationError(np.full((FRAMES, 2), NOISE), np.ones(FRAMES), np.ones(shape))
     # splines know of no channel with two open ends: the estimate is the filter's alone
     options = EnsembleOptions(estimated=ESTIMATED, increments=("ensemble",), model_error=0.02)
-    run = assimilate(measured, model, options=options, error=error, smoothed=measured, seed=1)
+    prepared = PreparedMeasurement(measured, error=error, smoothed=measured)
+    run = assimilate(prepared, model, options=options, seed=1)
     found = run.info["estimated"]
     for name, true, bound in (("valve_strength", strength, 0.04), ("viscosity", viscosity, 0.08)):
         assert found[name]["mean"] == pytest.approx(true, rel=bound)

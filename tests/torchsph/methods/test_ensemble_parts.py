@@ -11,14 +11,16 @@ import geometry
 from regularize import Smoother
 from torchsph.assimilation import ETKF, AssimilationError, LearnedGain, Observations, Reason, SpreadMatch
 from torchsph.data import sample_measurement
-from torchsph.evaluation.metrics import divergence_rms, spread_over_skill
+from torchsph.evaluation.divergence import divergence_rms
+from torchsph.evaluation.metrics import spread_over_skill
 from torchsph.methods.ensemble.divergence_cleaning import without_divergence
 from torchsph.methods.ensemble.forecaster import shares
 from torchsph.methods.ensemble.lagged import LaggedAnalyses
-from torchsph.methods.ensemble.regions import flow_regions
-from torchsph.methods.frame_splines import FrameSmoother
 from torchsph.methods.measurement.error_model import ObservationError
-from torchsph.methods.measurement.observation_operator import Source
+from torchsph.methods.measurement.frame_splines import FrameSmoother
+from torchsph.methods.measurement.observation_operator import Measurement
+from torchsph.methods.measurement.prepared import PreparedMeasurement
+from torchsph.methods.measurement.regions import flow_regions
 
 
 @pytest.fixture(scope="module")
@@ -168,7 +170,7 @@ def linear_field(grid: geometry.Grid) -> torch.Tensor:
     return torch.stack([1 + 20 * y, 2 - 10 * z, 30 * x])[None]
 
 
-def test_a_source_sees_its_own_nodes_its_beam_and_its_blur(measured):
+def test_a_measurement_sees_its_own_nodes_its_beam_and_its_blur(measured):
     mask = torch.ones(measured.grid.shape, dtype=torch.bool)
     field = linear_field(measured.grid)
     shifted = geometry.Grid(tuple(o + 0.4e-3 for o in measured.grid.origin), (2e-3,) * 3, (14, 8, 8))
@@ -185,14 +187,14 @@ def test_a_source_sees_its_own_nodes_its_beam_and_its_blur(measured):
         mu=measured.mu,
         beam=beam,
     )
-    source = Source(other, plain_error(other), measured.grid)
-    seen = source.see(0)
+    measurement = Measurement(PreparedMeasurement(other, error=plain_error(other)), measured.grid)
+    seen = measurement.see(0)
     exact = linear_field(shifted)[0]
     along = (0.6 * exact[1] + 0.8 * exact[2]).flatten()
-    torch.testing.assert_close(source.predict(field, mask, seen)[0], along, rtol=1e-5, atol=1e-6)
-    assert seen.parts == 1 and source.groups == 1
+    torch.testing.assert_close(measurement.predict(field, mask, seen)[0], along, rtol=1e-5, atol=1e-6)
+    assert seen.parts == 1 and measurement.type.parts == 1
     # far from the edges a Gaussian leaves a linear field as it is, and lowers a wave by exp(-k^2 s^2 / 2)
-    blurred = Source(measured, plain_error(measured, kernel=2.5e-3), measured.grid)
+    blurred = Measurement(PreparedMeasurement(measured, error=plain_error(measured, kernel=2.5e-3)), measured.grid)
     seen = blurred.see(0)
     wave = torch.cos(2 * math.pi / 8e-3 * measured.grid.nodes()[:, 2]).reshape(measured.grid.shape)
     fields = torch.cat([field, wave.expand(1, 3, *wave.shape)])
@@ -211,7 +213,7 @@ def test_missing_values_come_with_their_reason(measured):
     velocity[0, 0, k[0], j[0], i[0]] = np.nan
     weight[0, k[1], j[1], i[1]] = 0.0
     holed = replace(measured, velocity=velocity, weight=weight)
-    seen = Source(holed, plain_error(holed), holed.grid).see(0)
+    seen = Measurement(PreparedMeasurement(holed, error=plain_error(holed)), holed.grid).see(0)
     flat = np.ravel_multi_index((k, j, i), measured.grid.shape)
     codes = seen.observations.codes().reshape(3, -1)
     assert (codes[:, seen.node == int(flat[0])] == Reason.MISSING).all()

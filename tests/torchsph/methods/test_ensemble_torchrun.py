@@ -89,7 +89,7 @@ def frames_in(checkpoint: Path) -> int:
     if not checkpoint.exists():
         return 0
     try:
-        return len(torch.load(checkpoint, weights_only=True)["state"]["fields"])
+        return len(torch.load(checkpoint, weights_only=True)["state"]["analyses"]["fields"])
     except FileNotFoundError:  # the run has ended and removed it
         return 0
 

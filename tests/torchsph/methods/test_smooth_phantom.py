@@ -8,7 +8,7 @@ from paths import SHARED_DATA
 import geometry
 from regularize import Smoother
 from torchsph.evaluation.metrics import evaluate
-from torchsph.methods.frame_splines import FrameSmoother, smooth_frames
+from torchsph.methods.measurement.frame_splines import FrameSmoother, smooth_frames
 
 # NRMSE of weighted Gaussian smoothing over 3 mm, from the data's own description, and the share of it that is allowed
 CASES = [("lv_phantom_a_measured.h5", 0.602, 0.88), ("lv_phantom_a_noisy.h5", 0.786, 0.77)]

@@ -79,6 +79,7 @@ class FilterRecord:
         }
 
     def restore(self, state: dict) -> None:
+        """Go on from what ``state`` gave."""
         self.cycles, self._histogram = list(state["cycles"]), state["histogram"]
         self._warnings = dict(state["warnings"])
         self._innovations = {name: list(parts) for name, parts in state["innovations"].items()}

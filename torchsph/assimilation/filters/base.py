@@ -35,7 +35,8 @@ class Analysis:
         signal: `(*batch,)` degrees of freedom that the observations determined (of at most N - 1); for
             local analyses the mean over those that had observations.
         prior_factor: factor on the forecast's spread that was used, scalar or `(*batch,)`.
-        spread_before, spread_after: `(*batch,)` root mean variance over the state.
+        spread_before: `(*batch,)` root mean variance over the state of the forecast.
+        spread_after: `(*batch,)` that of the analysis.
         transform: the linear map of members that was applied; a smoother applies it to earlier states. None where
             it was left behind.
         rotation: `(*batch, N, N)` applied to the anomalies after it, or None.
@@ -101,13 +102,15 @@ class Filter(Protocol):
         state_positions: Tensor | None = None,
         generator: torch.Generator | None = None,
     ) -> Analysis:
-        """Args:
-        ensemble: `(*batch, N, n)` forecast.
-        predicted: `(*batch, N, m)` predicted observations; NaN where a member has none.
-        observations: of the same m.
-        state_positions: `(q, D)`, n a multiple of q, number k at position k % q (component-major fields);
-            needed by localised filters only. A NaN row is a number without a place (a parameter).
-        generator: needed by filters that draw random numbers.
+        """The analysis of a forecast.
+
+        Args:
+            ensemble: `(*batch, N, n)` forecast.
+            predicted: `(*batch, N, m)` predicted observations; NaN where a member has none.
+            observations: of the same m.
+            state_positions: `(q, D)`, n a multiple of q, number k at position k % q (component-major fields);
+                needed by localised filters only. A NaN row is a number without a place (a parameter).
+            generator: needed by filters that draw random numbers.
         """
 
     def screen(self, ensemble: Tensor, predicted: Tensor, observations: Observations) -> Screened:
@@ -118,7 +121,8 @@ class Transform(Protocol):
     """A linear map of members; `reached`, broadcastable to `(*batch, N, n)`, marks what it may change."""
 
     @property
-    def reached(self) -> Tensor | None: ...
+    def reached(self) -> Tensor | None:
+        """What the map may change; None where it may change all."""
 
     def apply(self, ensemble: Tensor) -> Tensor:
         """`(*batch, N, n)` -> analysed `(*batch, N, n)`, dtype kept, before inflation and rotation."""
@@ -136,6 +140,7 @@ class GlobalTransform:
     reached: Tensor | None = None
 
     def apply(self, ensemble: Tensor) -> Tensor:
+        """See `Transform.apply`."""
         mean = ensemble.double().mean(-2, keepdim=True)
         # On anomalies: members that share a large mean lose no digits.
         return (mean + self.matrix.mT @ (ensemble.double() - mean)).to(ensemble.dtype)
@@ -197,7 +202,11 @@ class EnsembleFilter(ABC):
         state_positions: Tensor | None = None,
         generator: torch.Generator | None = None,
     ) -> Analysis:
-        """See `Filter.analyse`. Raises `AssimilationError` on shapes that do not fit and on NaN members."""
+        """See `Filter.analyse`.
+
+        Raises:
+            AssimilationError: shapes that do not fit, or members that are not finite.
+        """
         check_ensemble(ensemble, predicted, observations)
         wide = predicted.double()
         mean = self._mean(wide)

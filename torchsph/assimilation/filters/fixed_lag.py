@@ -53,4 +53,5 @@ class FixedLagSmoother:
         return [state.clone() for state in self._states]
 
     def restore(self, states: list[Tensor]) -> None:
+        """Go on from what `state` gave."""
         self._states = deque(state.clone() for state in states)

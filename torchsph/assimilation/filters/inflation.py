@@ -41,9 +41,11 @@ class Multiplicative:
             raise AssimilationError(f"Multiplicative.factor must be positive, got {self.factor}")
 
     def prior_factor(self, screened: Screened) -> float:
+        """See `Inflation.prior_factor`."""
         return 1.0
 
     def relax(self, prior: Tensor, posterior: Tensor, reached: Tensor | None) -> Tensor:
+        """See `Inflation.relax`."""
         inflated = posterior * self.factor
         return inflated if reached is None or self.everywhere else torch.where(reached, inflated, posterior)
 
@@ -64,9 +66,11 @@ class RTPS:
             raise AssimilationError(f"RTPS needs 0 <= alpha <= 1 and largest >= 1, got {self}")
 
     def prior_factor(self, screened: Screened) -> float:
+        """See `Inflation.prior_factor`."""
         return 1.0
 
     def relax(self, prior: Tensor, posterior: Tensor, reached: Tensor | None) -> Tensor:
+        """See `Inflation.relax`."""
         before, after = prior.std(-2, keepdim=True), posterior.std(-2, keepdim=True)
         tiny = torch.finfo(after.dtype).tiny
         factor = 1 + self.alpha * (before - after) / after.clamp(min=tiny)
@@ -84,9 +88,11 @@ class RTPP:
             raise AssimilationError(f"RTPP needs 0 <= alpha <= 1, got {self.alpha}")
 
     def prior_factor(self, screened: Screened) -> float:
+        """See `Inflation.prior_factor`."""
         return 1.0
 
     def relax(self, prior: Tensor, posterior: Tensor, reached: Tensor | None) -> Tensor:
+        """See `Inflation.relax`."""
         return (1 - self.alpha) * posterior + self.alpha * prior
 
 
@@ -116,9 +122,11 @@ class Adaptive:
         return {"square": self._square.clone(), "variance": self._variance.clone()}
 
     def restore(self, state: dict[str, Tensor]) -> None:
+        """Go on from what `state` gave."""
         self._square, self._variance = state["square"].clone(), state["variance"].clone()
 
     def prior_factor(self, screened: Screened) -> Tensor:
+        """See `Inflation.prior_factor`."""
         used = screened.used
         ratio = torch.where(used, screened.predicted_variance / screened.variance, 0.0).sum(-1)
         excess = torch.where(used, screened.innovation**2 / screened.variance - 1, 0.0).sum(-1)
@@ -137,4 +145,5 @@ class Adaptive:
         return self._square.sqrt()
 
     def relax(self, prior: Tensor, posterior: Tensor, reached: Tensor | None) -> Tensor:
+        """See `Inflation.relax`."""
         return posterior

@@ -53,6 +53,7 @@ class Localisation:
 
     @property
     def off(self) -> bool:
+        """Whether nothing is local."""
         return self.radius == 0 or (isinstance(self.radius, tuple) and min(self.radius) == 0)
 
     def scaled(self, positions: Tensor) -> Tensor:

@@ -40,19 +40,23 @@ class Simplex:
     Moireau & Chapelle 2011, ESAIM: COCV 17, section 3.3). Symmetric to second order only."""
 
     def size(self, rank: int) -> int:
+        """See `SigmaPoints.size`."""
         return rank + 1
 
     def rank(self, size: int) -> int:
+        """See `SigmaPoints.rank`."""
         if size < 2:
             raise AssimilationError(f"a simplex needs at least 2 points, got {size}")
         return size - 1
 
     def rule(self, rank: int, device: torch.device | str | None = None) -> tuple[Tensor, Tensor]:
+        """See `SigmaPoints.rule`."""
         size = rank + 1
         weight = torch.full((size,), 1 / size, dtype=torch.float64, device=device)
         return weight, size**0.5 * zero_sum_basis(size, device=device)
 
     def gather(self, points: Tensor) -> ErrorSubspace:
+        """See `SigmaPoints.gather`."""
         weight, coordinate = self.rule(self.rank(points.shape[-2]), points.device)
         modes = (weight.unsqueeze(-1) * coordinate).mT @ points.double()
         return _unit(points.double().mean(-2), modes)
@@ -86,14 +90,17 @@ class Symmetric:
             )
 
     def size(self, rank: int) -> int:
+        """See `SigmaPoints.size`."""
         return 2 * rank + 1
 
     def rank(self, size: int) -> int:
+        """See `SigmaPoints.rank`."""
         if size < 3 or size % 2 == 0:
             raise AssimilationError(f"a symmetric set has 2 r + 1 points (3, 5, 7 ...), got {size}")
         return (size - 1) // 2
 
     def rule(self, rank: int, device: torch.device | str | None = None) -> tuple[Tensor, Tensor]:
+        """See `SigmaPoints.rule`."""
         square = self.alpha**2 * (rank + self.kappa)
         weight = torch.full((2 * rank + 1,), 0.5 / square, dtype=torch.float64, device=device)
         weight[0] = 1 - rank / square
@@ -101,6 +108,7 @@ class Symmetric:
         return weight, torch.cat([unit[:1] * 0, unit, -unit])
 
     def gather(self, points: Tensor) -> ErrorSubspace:
+        """See `SigmaPoints.gather`."""
         weight, _ = self.rule(self.rank(points.shape[-2]), points.device)
         centre = points[..., :1, :].double()
         distance = points[..., 1:, :].double() - centre

@@ -106,6 +106,7 @@ class ErrorSubspace:
 
     @property
     def rank(self) -> int:
+        """Number of modes."""
         return self.modes.shape[-2]
 
     def square_root(self) -> Tensor:

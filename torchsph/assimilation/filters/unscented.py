@@ -25,6 +25,7 @@ class UnscentedUpdate:
     nis: Tensor
 
     def counts(self) -> dict[str, int]:
+        """Number of observations per `Reason`, those used among them."""
         return count_reasons(self.reason)
 
 

@@ -43,9 +43,11 @@ class ErrorScale:
         return self._factor.clone()
 
     def state(self) -> dict[str, Tensor]:
+        """What a checkpoint has to hold."""
         return {"factor": self._factor.clone(), "cycles": self._cycles.clone()}
 
     def restore(self, state: dict[str, Tensor]) -> None:
+        """Go on from what `state` gave."""
         self._factor, self._cycles = state["factor"].clone(), state["cycles"].clone()
 
     def apply(self, observations: Observations, group: Tensor | int = 0) -> Observations:

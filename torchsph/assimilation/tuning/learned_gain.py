@@ -51,9 +51,11 @@ class LearnedGain:
         return self._weight.clone()
 
     def state(self) -> dict[str, Tensor]:
+        """What a checkpoint has to hold."""
         return {"weight": self._weight.clone(), "normal": self._normal.clone(), "right": self._right.clone()}
 
     def restore(self, state: dict[str, Tensor]) -> None:
+        """Go on from what `state` gave."""
         self._weight, self._normal, self._right = (state[name].clone() for name in ("weight", "normal", "right"))
 
     def learn(self, seen: Tensor, innovation: Tensor, weight: Tensor) -> None:

@@ -21,7 +21,8 @@ class Parameter:
 
     Attributes:
         name: for dictionaries and messages.
-        low, high: open bounds; infinite by default.
+        low: open lower bound; infinite by default.
+        high: open upper bound; infinite by default.
         smallest_spread: standard deviation in the unbounded coordinate below which the ensemble is not let
             fall; a parameter has no dynamics that would restore its spread (Aksoy et al. 2006, MWR 134).
     """

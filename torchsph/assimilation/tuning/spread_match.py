@@ -38,6 +38,7 @@ class SpreadMatch:
         self._taken, self._before = 0.0, 0.0
 
     def state(self) -> dict[str, float]:
+        """What a checkpoint has to hold."""
         return {
             "factor": self.factor,
             "now": self.now,
@@ -47,6 +48,7 @@ class SpreadMatch:
         }
 
     def restore(self, state: dict[str, float]) -> None:
+        """Go on from what `state` gave."""
         self.factor, self.now, self.cycles = state["factor"], state["now"], int(state["cycles"])
         self._taken, self._before = state["taken"], state["before"]
 
@@ -64,7 +66,8 @@ class SpreadMatch:
         """Factor on the analysed anomalies that leaves them the variance of what is left of the error.
 
         Args:
-            before, after: sums over the state of the ensemble's variance, in the forecast and as the filter leaves it.
+            before: sum over the state of the ensemble's variance in the forecast.
+            after: the same as the filter leaves it.
             taken: sum over the state of the squared increment.
         """
         before *= self.now**2

@@ -8,6 +8,8 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import cg
 
+from torchsph.evaluation.divergence import interior_nodes
+
 # a result that misses the reduction asked for by more than this factor is not taken
 _ENOUGH = 3.0
 
@@ -61,15 +63,7 @@ def _divergence(mask: np.ndarray, spacing: tuple[float, ...]) -> sparse.csr_matr
     """Rows: nodes with all neighbours in the mask; columns: component-major velocities at the nodes of the mask."""
     number = np.full(mask.shape, -1)
     number[mask] = np.arange(mask.sum())
-    interior = mask.copy()
-    for axis in range(mask.ndim):
-        for way in (1, -1):
-            beside = np.roll(mask, way, axis)
-            edge = [slice(None)] * mask.ndim
-            edge[axis] = 0 if way == 1 else -1
-            beside[tuple(edge)] = False
-            interior &= beside
-    where = np.argwhere(interior)
+    where = np.argwhere(interior_nodes(mask))
     count, total = len(where), int(mask.sum())
     index, column, value = [], [], []
     for component, step in enumerate(spacing):

@@ -9,13 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import NamedTuple
 
 import torch
 import torch.distributed as dist
 from torch import Tensor
 
 import geometry
+from torchsph.assimilation import gather_members
 from torchsph.simulator.failures import NumericalFailure
 from torchsph.simulator.grid_forecast import GridForecast, Transfer
 from torchsph.simulator.simulator import Simulator
@@ -26,7 +27,8 @@ class Ensemble:
     """The estimate and the members around it.
 
     Attributes:
-        control: (D, *shape), m/s. members: (N, D, *shape), m/s; their mean need not be the control.
+        control: (D, *shape), m/s.
+        members: (N, D, *shape), m/s; their mean need not be the control.
         parameters: (N,) of each estimated parameter by its name.
     """
 
@@ -44,8 +46,10 @@ class Forecasts:
     """An ensemble at the times asked for.
 
     Attributes:
-        states: one ensemble per time. covered: (*shape) bool at the last time, of the control.
-        failed: (N,) bool. control_failed: the members' mean then stands for the control.
+        states: one ensemble per time.
+        covered: (*shape) bool at the last time, of the control.
+        failed: (N,) bool.
+        control_failed: the members' mean then stands for the control.
         steps: of all runs of this process together.
         shock: what the projection had to take from the control's start, relative (``GridForecast.shock``).
     """
@@ -55,6 +59,14 @@ class Forecasts:
     failed: Tensor
     control_failed: bool
     steps: int
+    shock: float
+
+
+class Control(NamedTuple):
+    """The control's run: (times, D, *shape), NaN where it failed; (*shape) what it covers at the end; its shock."""
+
+    fields: Tensor
+    covered: Tensor
     shock: float
 
 
@@ -76,7 +88,10 @@ class Forecaster:
     """Runs the control and the members from one analysis to the next.
 
     Args:
-        model: of the control. coarse: of the members. grid: of the state. transfer: how grid forecasts are made.
+        model: of the control.
+        coarse: of the members.
+        grid: of the state.
+        transfer: how grid forecasts are made.
         batch: members that are simulated together. They share the search of neighbours, whose times decide on the last
             digits of their sums: with the same batches the same bits result, whatever process runs them.
     """
@@ -113,9 +128,9 @@ class Forecaster:
         run = self._members(ensemble, mine, *here)
         own, steps = None, run[1]
         if lead:
-            *own, more = self._control(ensemble, *here)
+            own, more = self._control(ensemble, *here)
             steps += more
-        fields, control, covered, shock = self._gathered(ensemble, run[0], own, len(times), todo)
+        fields, (control, covered, shock) = self._gathered(ensemble, run[0], own, len(times), todo)
         failed = ~torch.isfinite(fields).flatten(2).all(2).all(0)
         lost = not bool(torch.isfinite(control).all())
         if lost:
@@ -149,13 +164,13 @@ class Forecaster:
 
     def _control(
         self, ensemble: Ensemble, start: float, mask: Tensor, times: Sequence[float], masks: Sequence[Tensor]
-    ) -> tuple[Tensor, Tensor, float, int]:
-        """(times, D, *shape) of the control, NaN where it failed; what it covers at the end; its shock; its steps."""
+    ) -> tuple[Control, int]:
+        """The control's own run, and its steps."""
         middle = {name: row.mean()[None] for name, row in ensemble.parameters.items()}
         found, covered, failed, shock, steps = self._run(
             self.model, ensemble.control[None], middle, start, mask, times, masks
         )
-        return torch.where(failed[0], torch.nan, found[:, 0]), covered[0], float(shock[0]), steps
+        return Control(torch.where(failed[0], torch.nan, found[:, 0]), covered[0], float(shock[0])), steps
 
     def _run(
         self,
@@ -186,27 +201,28 @@ class Forecaster:
 
     @staticmethod
     def _gathered(
-        ensemble: Ensemble, members: Tensor, control: list[Any] | None, times: int, todo: list[tuple[bool, slice]]
-    ) -> tuple[Tensor, Tensor, Tensor, float]:
-        """All members (times, N, ...), the control (times, ...), its cover and its shock, the same in every process.
+        ensemble: Ensemble, members: Tensor, control: Control | None, times: int, todo: list[tuple[bool, slice]]
+    ) -> tuple[Tensor, Control]:
+        """All members (times, N, ...) and the control's run, the same in every process.
 
-        ``members`` (times, k, ...): of this process. ``control``: the three of them, in the process that ran it.
+        Args:
+            ensemble: before the forecast.
+            members: (times, k, ...) of this process.
+            control: in the process that ran it.
+            times: their number.
+            todo: who ran what (``shares``).
         """
-        if len(todo) == 1:
-            return members, *control
+        if len(todo) == 1 and control is not None:
+            return members, control
         counts = [part.stop - part.start for _, part in todo]
-        padded = members.new_zeros((max(counts), *members.transpose(0, 1).shape[1:]))
-        padded[: members.shape[1]] = members.transpose(0, 1)
-        parts = [torch.empty_like(padded) for _ in counts]
-        dist.all_gather(parts, padded)
-        everyone = torch.cat([part[:size] for part, size in zip(parts, counts, strict=True)]).transpose(0, 1)
+        everyone = gather_members(members.transpose(0, 1), counts).transpose(0, 1)
         shape = (times, *ensemble.control.shape)
         if control is None:
-            control = [torch.empty(shape), torch.empty(shape[2:], dtype=torch.bool), 0.0]
+            control = Control(torch.empty(shape), torch.empty(shape[2:], dtype=torch.bool), 0.0)
         field, covered, shock = control
         packed = torch.cat([field.flatten(), covered.to(field).flatten()]).double()
         packed = torch.cat([packed, torch.tensor([shock], dtype=torch.float64)])
         dist.broadcast(packed, 0)
         size = field.numel()
         field = packed[:size].to(field).reshape(shape)
-        return everyone, field, packed[size:-1].reshape(shape[2:]) > 0.5, float(packed[-1])
+        return everyone, Control(field, packed[size:-1].reshape(shape[2:]) > 0.5, float(packed[-1]))

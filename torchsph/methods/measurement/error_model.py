@@ -18,8 +18,9 @@ from scipy.ndimage import gaussian_filter
 from scipy.optimize import brentq
 
 import geometry
+from torchsph.assimilation.diagnostics.scores import CHI2_MEDIAN
 
-from ..frame_splines import FrameSmoother, node_weights
+from .frame_splines import FrameSmoother, node_weights
 
 _MAD_TO_STD = 1.4826
 _SURPRISING = 3.0
@@ -31,7 +32,6 @@ _LITTLE = 0.05
 _ABOVE = 1.5  # times the stated deviation: more is no noise
 _MOST_TRUST = 2.0
 _AROUND = 2.0  # nodes, deviation of the Gaussian that averages the residuals' level
-_MEDIAN_OF_SQUARE = 0.454936423119572
 _FWHM = 2.0 * math.sqrt(2.0 * math.log(2.0))
 
 
@@ -64,6 +64,8 @@ class ObservationError:
         weight = node_weights(recording, frame)
         measured = weight > 0
         if self.deviation is None:
+            if recording.sigma is None:
+                raise ValueError("an error model without deviations needs a recording with /sigma")
             own = recording.sigma[frame].astype(np.float64) ** 2
             return np.where(measured, own * self.surprise[frame], np.inf)
         mean = weight[measured].mean() if measured.any() else 1.0
@@ -82,16 +84,17 @@ def estimate_error(
     redundancy makes it the white-equivalent deviation: what independent errors would have to be to disturb long waves
     as much, the larger of what the spline's likelihood chose and of the kernel's volume in nodes. Nodes beyond
     ``_SURPRISING`` deviations count less, as the square of their distance (the weight of a Student distribution's far
-    tail). For a measurement along a beam all of it is about that one component.
+    tail). Where components alone were measured, all of it is about them.
 
-    Raises ValueError where nothing was measured at all.
+    Raises:
+        ValueError: nothing was measured at all.
     """
     residual = np.nan_to_num(measured.velocity - smoothed.velocity).astype(np.float64)
     used = np.stack([node_weights(measured, f) > 0 for f in range(measured.frames)])
     if not used.any():
         raise ValueError("the measurement has no node with a positive weight: nothing is known about the flow")
-    if measured.beam is not None:  # what the beam does not see is no error
-        residual = (residual * measured.beam).sum(1, keepdims=True)
+    kind = geometry.measurement_type(measured)
+    residual = kind.components(residual)  # what the instrument does not see is no error
     parts, ones = residual.shape[1], (1,) * measured.dimension
     robust = np.stack([_robust_deviation(residual[f], used[f]) for f in range(measured.frames)])
     robust = np.where(np.isfinite(robust), robust, np.nanmedian(robust, axis=0))
@@ -99,18 +102,21 @@ def estimate_error(
     robust = np.maximum(robust, 1e-3 * speed + 1e-6)
     distance = np.sqrt(np.mean((residual / robust.reshape(-1, parts, *ones)) ** 2, axis=1))
     surprise = np.maximum(distance / _SURPRISING, 1.0) ** 2
-    told = measured.sigma is not None
+    sigma = measured.sigma
+    told = sigma is not None
     if not told:
         surprise *= np.stack([_local_level(distance[f], used[f]) for f in range(measured.frames)])
     left = float(np.median(robust))
-    stated = float(np.median(measured.sigma[np.repeat(used[:, None], measured.dimension, 1)])) if told else math.inf
+    stated = math.inf
+    if sigma is not None:
+        stated = float(np.median(sigma[np.repeat(used[:, None], measured.dimension, 1)]))
     # residuals that are next to nothing, or far above the noise that the file states, are the spline's, not noise; so
     # is much of what one component's spline leaves, which the file's own deviation makes needless
-    noisy = _LITTLE * speed < left < _ABOVE * stated and not (told and measured.beam is not None)
+    noisy = _LITTLE * speed < left < _ABOVE * stated and (kind.full or not told)
     kernel = kernel_width(residual, used, measured.grid.spacing) if noisy else 0.0
     redundancy = np.full(measured.frames, _nodes_of(kernel, measured.grid.spacing))
     for frame in range(measured.frames):
-        choice = None if measured.beam is not None else splines.choice(frame)
+        choice = splines.choice(frame) if kind.full else None
         if choice is not None:
             chosen = float(np.mean((np.array(choice.noise) / robust[frame]) ** 2))
             redundancy[frame] = max(redundancy[frame], chosen)
@@ -151,7 +157,7 @@ def _median_square(part: np.ndarray, used: np.ndarray, axis: int, lag: int) -> f
     early, late = np.arange(part.shape[axis] - lag), np.arange(lag, part.shape[axis])
     both = np.take(used, early, axis) & np.take(used, late, axis)
     steps = (np.take(part, late, axis) - np.take(part, early, axis))[both]
-    return float(np.median(np.abs(steps)) ** 2 / _MEDIAN_OF_SQUARE) if len(steps) else 0.0
+    return float(np.median(np.abs(steps)) ** 2 / CHI2_MEDIAN) if len(steps) else 0.0
 
 
 def _width_of(ratio: float) -> float:

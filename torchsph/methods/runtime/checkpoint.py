@@ -12,7 +12,7 @@ import numpy as np
 import torch
 import torch.distributed as dist
 
-_FORMAT = 2
+_FORMAT = 3
 
 
 def fingerprint(parts: Iterable[object]) -> str:
@@ -46,7 +46,8 @@ def save(path: Path, key: str, state: dict[str, Any]) -> None:
 def load(path: Path, key: str) -> dict[str, Any] | None:
     """The state in ``path``, or None where there is none; of several processes the first reads for all.
 
-    Raises ValueError where it was written by another run: other options, members, seed or recordings.
+    Raises:
+        ValueError: it was written by another run: other options, members, seed or recordings.
     """
     held: list[dict[str, Any] | None] = [None]
     lead = not dist.is_initialized() or dist.get_rank() == 0

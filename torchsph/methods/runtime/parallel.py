@@ -7,11 +7,14 @@ import time
 import uuid
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import TypeVar
+from typing import Any, TypeVar
 
+import torch
 import torch.distributed as dist
 
 T = TypeVar("T")
+A = TypeVar("A")
+B = TypeVar("B")
 
 # s between two looks for processes that have not come yet
 _PAUSE = 0.02
@@ -89,6 +92,18 @@ def shared(tasks: Sequence[Callable[[], T]]) -> list[T]:
     parts: list[list[T]] = [[] for _ in range(processes)]
     dist.all_gather_object(parts, [task() for task in tasks[rank::processes]])
     return [parts[k % processes][k // processes] for k in range(len(tasks))]
+
+
+def shared_pair(first: Callable[[], A], second: Callable[[], B]) -> tuple[A, B]:
+    """The results of two tasks of different types; see ``shared``."""
+    tasks: list[Callable[[], Any]] = [first, second]
+    one, other = shared(tasks)
+    return one, other
+
+
+def forked(generator: torch.Generator) -> torch.Generator:
+    """A generator of its own for what one process alone may do; the one given moves on by one number in all."""
+    return torch.Generator().manual_seed(int(torch.randint(2**62, (), generator=generator)))
 
 
 def from_last(value: T) -> T:

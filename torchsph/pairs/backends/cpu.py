@@ -15,6 +15,7 @@ from ..interface import Moments, PairState, Support, check_search
 from ..poisson import PoissonSolution
 from . import cpu_operators as operators
 from . import plan
+from .checks import check_groups, check_particles, check_period, expect
 from .planned import PlannedBackend, lengths, slope_of
 
 # buffers of lists that nobody holds any more; a few, so that memory is given back
@@ -79,6 +80,8 @@ class CpuBackend(PlannedBackend[ClusterPairs]):
         period: Tensor | None = None,
     ) -> ClusterPairs:
         self.check(position)
+        check_particles(position, member)
+        check_period(period, position.shape[1])
         length = lengths(period, position.shape[1])
         check_search(None, radius + margin, period)
         entries = self._room(int(1.1 * self.entries_per_particle * position.shape[0]) + 64)
@@ -151,6 +154,12 @@ class CpuBackend(PlannedBackend[ClusterPairs]):
     ) -> PoissonSolution:
         self.check(state.position, source, *(() if start is None else (start,)))
         self._check_state(pairs, state)
+        self._check_field(state, source, active)
+        if start is not None:
+            expect("start", start, (pairs.count,))
+        expect("free", free, (pairs.count,), torch.bool)
+        expect("singular", singular, (-1,), torch.bool)
+        check_groups(state.member if group is None else group, singular.shape[0], pairs.count)
         kind, numbers = plan.kernel_choice(support, self.name)
         group = state.member if group is None else group
         values, count, residual, converged, mismatch = operators.poisson(
@@ -186,6 +195,13 @@ class CpuBackend(PlannedBackend[ClusterPairs]):
         weight: Tensor | None = None,
     ) -> Moments:
         self.check(position, fields, query, *(() if weight is None else (weight,)))
+        check_particles(position, member)
+        check_particles(query, query_member, ("query", "query_member"))
+        check_period(period, position.shape[1])
+        expect("query", query, (-1, position.shape[1]))
+        expect("fields", fields, (position.shape[0], -1))
+        if weight is not None:
+            expect("weight", weight, (position.shape[0],))
         check_search(None, support.radius, period)
         members = 1 + max((int(m.max()) for m in (member, query_member) if m.numel()), default=0)
         kind, numbers = plan.kernel_choice(support, self.name)

@@ -11,14 +11,20 @@ from torch import Tensor
 
 from ..interface import Backend, MomentumTerms, PairState, Rates, RateTerms, Support
 from . import plan
+from .checks import check_shapes, expect
 
 
 class Counted(Protocol):
-    """Pairs that know of how many particles they are."""
+    """Pairs that know of how many particles they are, and in how many dimensions."""
 
     @property
     def count(self) -> int:
         """Number of particles of the search."""
+        ...
+
+    @property
+    def period(self) -> list[float]:
+        """Of each axis, inf where it is not periodic."""
         ...
 
 
@@ -77,8 +83,8 @@ class PlannedBackend(Backend[Planned]):
     def laplacian(
         self, pairs: Planned, state: PairState, support: Support, field: Tensor, active: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
-        self.check(state.position, field)
         self._check_state(pairs, state)
+        self._check_field(state, field, active)
         request = plan.Pass(plan.LAPLACIAN, plan.BY_VOLUME)
         total, diagonal = self._evaluate(pairs, state, support, request, field, active)
         return total, diagonal
@@ -91,8 +97,10 @@ class PlannedBackend(Backend[Planned]):
         for request in requests:
             if request.terms & plan.STRESSED:
                 self.check(state.position, state.pressure)
+                expect("the state's pressure", state.pressure, (pairs.count,))
             if request.terms & plan.SLOPED:
                 self.check(state.position, slope_of(state))
+                expect("the state's slope", slope_of(state), tuple(state.position.shape))
             outputs = self._evaluate(pairs, state, support, request)
             sums.update(zip(request.outputs, outputs, strict=True))
         return sums
@@ -103,6 +111,14 @@ class PlannedBackend(Backend[Planned]):
             raise ValueError(
                 f"the pairs are of {pairs.count} particles and the state of {state.position.shape[0]}: search anew"
             )
+        check_shapes(state, len(pairs.period))
+
+    def _check_field(self, state: PairState, field: Tensor, active: Tensor | None) -> None:
+        count = state.position.shape[0]
+        self.check(state.position, field)
+        expect("the field", field, (count,))
+        if active is not None:
+            expect("active", active, (count,), torch.bool)
 
     def check(self, *tensors: Tensor) -> None:
         """ValueError or TypeError unless all tensors are of one real type, here, without gradient."""

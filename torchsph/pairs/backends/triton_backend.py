@@ -22,6 +22,7 @@ from ..cell_search import _cells, _key, _shifted
 from ..interface import Moments, PairState, Support, check_search
 from ..terms import BY_VOLUME, FIELDS, SLOPE, VALUE, outputs_of, reading
 from . import plan
+from .checks import check_particles, check_period
 from .planned import PlannedBackend, lengths
 from .reference import SINGULARITY, ReferenceBackend
 
@@ -103,6 +104,8 @@ class CudaBackend(PlannedBackend[CellRuns]):
         period: Tensor | None = None,
     ) -> CellRuns:
         self.check(position)
+        check_particles(position, member)
+        check_period(period, position.shape[1])
         check_search(position, radius + margin, period)
         return cell_runs(position, member, radius + margin, period)
 

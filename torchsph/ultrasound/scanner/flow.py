@@ -125,7 +125,7 @@ class RecordingFlow:
         recording, pad = self._recording, self._pad
         mask = np.pad(recording.mask[frame], pad)
         velocity = np.pad(recording.velocity[frame], [(0, 0)] + [(pad, pad)] * mask.ndim)
-        surface = recording.wall.at(frame)
+        surface = recording.wall_for("the simulated scanner").at(frame)
         _, nearest = cKDTree(surface.vertices).query(self._nodes)
         of_wall = np.zeros(len(surface.vertices), bool)
         of_wall[surface.faces[surface.region == 0].reshape(-1)] = True
@@ -175,7 +175,7 @@ def refined(field: Tensor, factor: int) -> Tensor:
 
 def wall_velocity(recording: Recording, frame: int) -> np.ndarray:
     """Velocity (nv, D), m/s, of the wall's vertices at a frame: as recorded, or differenced."""
-    wall = recording.wall
+    wall = recording.wall_for("the velocity of the wall")
     if wall.velocity is not None:
         return np.asarray(wall.velocity[frame], np.float64)
     if not wall.moves or recording.frames == 1:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -13,9 +14,10 @@ from tqdm import tqdm
 
 import geometry
 import regularize
+from regularize.solvers.factor import Factor
 
-from .runtime.parallel import shared
-from .wall_rows import wall_rows
+from ..runtime.parallel import shared
+from .wall_rows import at_knots, wall_rows
 
 # noise and smoothness are chosen in every third frame and serve its neighbours: flow and noise change over tens of
 # milliseconds, and a choice costs four times a fit
@@ -30,30 +32,47 @@ def node_weights(recording: geometry.Recording, frame: int) -> np.ndarray:
     return np.where(np.isfinite(recording.velocity[frame]).all(0), weight, 0.0)
 
 
-def beam_at(recording: geometry.Recording, frame: int) -> np.ndarray | None:
-    """Unit vectors (D, *shape) along which alone a frame was measured, or None for full vectors."""
-    beam = recording.beam
-    return None if beam is None else np.ascontiguousarray(beam if beam.ndim == recording.dimension + 1 else beam[frame])
-
-
 class FrameSmoother:
     """Spline fits of a recording's frames; neighbouring frames share what was chosen automatically.
 
     Args:
-        recording: the measurement. smoother: options of the fit. choose_every: frames that share one choice.
+        recording: the measurement.
+        smoother: options of the fit.
+        choose_every: frames that share one choice.
+        estimates: of the recording's walls and valves, where they are there already.
     """
 
     def __init__(
-        self, recording: geometry.Recording, smoother: regularize.Smoother, choose_every: int = CHOICE_EVERY
+        self,
+        recording: geometry.Recording,
+        smoother: regularize.Smoother,
+        choose_every: int = CHOICE_EVERY,
+        *,
+        estimates: geometry.Estimates | None = None,
     ) -> None:
         if choose_every < 1:
             raise ValueError(f"choose_every must be at least 1, got {choose_every}")
-        if recording.beam is not None and smoother.automatic:
-            smoother = smoother.fixed()  # there is no automatic choice from one component along a beam
+        self.estimates = geometry.estimated(recording) if estimates is None else estimates
+        recording = self.estimates.recording
+        self.type = geometry.measurement_type(recording)
+        if smoother.automatic and not self.type.full:
+            smoother = smoother.fixed()  # there is no automatic choice from components alone
+        if smoother.spacing is None:
+            smoother = replace(smoother, spacing=recording.grid.spacing)
+        self.motion: geometry.WallMotion | None = None
+        self._sampler: geometry.WallSampler | None = None
+        if recording.wall is not None:
+            self.motion = geometry.WallMotion.from_recording(recording)
+            if smoother.nodes is None:
+                self.motion, self._sampler = at_knots(self.motion, max(smoother.knots_at(recording.grid.spacing)))
         self.recording, self.smoother, self.choose_every = recording, smoother, choose_every
-        self.motion = geometry.WallMotion.from_recording(recording)
         self.nodes = recording.grid.nodes()
         self._choices: dict[int, regularize.Choice | None] = {}
+
+    def warn(self) -> None:
+        """Warn of all that walls and valves were believed otherwise than the recording has them."""
+        for text in self.estimates.warnings:
+            warnings.warn(text, stacklevel=3)
 
     def choice(self, frame: int) -> regularize.Choice | None:
         """What was chosen for the middle frame of the frame's group, or the nearest to it that measured anything.
@@ -74,7 +93,8 @@ class FrameSmoother:
     def fit(self, frame: int, *, uncertainty: bool = False) -> regularize.SplineField:
         """The spline of one frame; ``uncertainty`` keeps what its standard deviation needs.
 
-        Raises ValueError where no node has a positive weight.
+        Raises:
+            ValueError: no node has a positive weight.
         """
         return self._fit(frame, uncertainty=uncertainty, choice=self.choice(frame))
 
@@ -96,7 +116,7 @@ class FrameSmoother:
             points.double(),
             samples.double(),
             weight.double(),
-            self._resting(frame),
+            self._walls(frame, at_rest=True),
             divergence_points=self._inside(frame),
             choice=choice,
             judged=0,
@@ -120,7 +140,7 @@ class FrameSmoother:
             points.double(),
             samples.double(),
             weight.double(),
-            self._resting(frame),
+            self._walls(frame, at_rest=True),
             divergence_points=self._inside(frame),
             beam=beam,
         )
@@ -130,8 +150,11 @@ class FrameSmoother:
         # a forecast's errors reach as far as those that samples share: the ones would be taken for the others
         return replace(self.smoother, correlated=False)
 
-    def _resting(self, frame: int) -> regularize.WallRows:
-        return wall_rows(self.recording, self.motion, frame, at_rest=True)
+    def _walls(self, frame: int, *, at_rest: bool = False) -> regularize.WallRows | None:
+        """Rows of the walls at a frame; None where the recording has no wall."""
+        if self.motion is None:
+            return None
+        return wall_rows(self.recording, self.motion, frame, at_rest=at_rest, sampler=self._sampler)
 
     def _inside(self, frame: int) -> Tensor:
         """(n, D) nodes in the mask of a frame."""
@@ -149,13 +172,15 @@ class FrameSmoother:
             raise ValueError(f"frame {frame} (t = {time:g} s) has no node with a positive weight inside the mask")
         field = recording.velocity[frame].reshape(dimension, -1)
         samples = torch.from_numpy(np.nan_to_num(field, copy=True)).double().T
+        components = self.type.at(frame, torch.nonzero(used).squeeze(1))
+        points, rows, confidence, beam = components.spline_rows(self.nodes[used], samples[used], weight[used])
         return self.smoother.fit(
-            self.nodes[used],
-            samples[used],
-            weight[used],
-            wall_rows(recording, self.motion, frame),
+            points,
+            rows,
+            confidence,
+            self._walls(frame),
             divergence_points=self.nodes[mask],
-            beam=self._beam(frame, used),
+            beam=beam,
             uncertainty=uncertainty,
             choice=choice,
         )
@@ -189,13 +214,18 @@ class FrameSmoother:
         """(count, D, *shape) deviations from a fit of ``uncertainty=True``, drawn from its posterior; 0 outside.
 
         Their RMS over the mask is that of the stated deviation, component by component.
+
+        Raises:
+            ValueError: the fit has not kept its uncertainty.
         """
-        recording = self.recording
+        recording, factor, posterior = self.recording, fitted.factor, fitted.posterior
+        if not isinstance(factor, Factor) or posterior is None:
+            raise ValueError("draws need a fit that keeps its uncertainty: fit(frame, uncertainty=True)")
         mask = torch.from_numpy(np.array(recording.mask[frame], bool).reshape(-1))
         out = torch.zeros((count, recording.dimension, recording.grid.size), dtype=torch.float64)
         for one in out:
             drawn = torch.zeros((fitted.knots.nodes, recording.dimension), dtype=torch.float64)
-            drawn[fitted.factor.ordering.nodes] = fitted.factor.sample(fitted.posterior.precision, generator)
+            drawn[factor.ordering.nodes] = factor.sample(posterior.precision, generator)
             coefficients = drawn.T.reshape(-1, *fitted.knots.shape)
             one[:, mask] = regularize.SplineField(fitted.knots, coefficients, fitted.covered)(
                 self.nodes[mask], outside=0.0
@@ -205,11 +235,6 @@ class FrameSmoother:
         own = out[:, :, mask].square().mean((0, 2)).sqrt().clamp_min(1e-300)
         out *= (stated / own)[:, None]
         return out.reshape(count, recording.dimension, *recording.grid.shape)
-
-    def _beam(self, frame: int, used: Tensor) -> Tensor | None:
-        """(n, D) directions of the used nodes, or None for full vectors."""
-        beam = beam_at(self.recording, frame)
-        return None if beam is None else torch.from_numpy(beam.reshape(self.recording.dimension, -1)).double().T[used]
 
     def on_grid(self, fitted: regularize.SplineField, frame: int) -> np.ndarray:
         """The field at the nodes (D, *shape) float32, 0 outside the mask."""
@@ -222,18 +247,21 @@ class FrameSmoother:
 def smooth(
     measured: geometry.Recording, smoother: regularize.Smoother | None = None, *, progress: bool = False
 ) -> geometry.Recording:
-    """Fit every frame of a measurement by a penalised B-spline (thesis section 3.2).
+    """Fit every frame of a measurement by a penalised B-spline (Grønli 2017, sec. 3.2).
 
     Noise and smoothness are chosen automatically every few frames; outliers are judged in every frame.
 
     Args:
-        measured: the measurement. smoother: options; None takes the default preset.
+        measured: the measurement.
+        smoother: options; None takes the default preset.
         progress: show a bar on stderr (only on a terminal).
 
     Returns:
         A recording on the measurement's grid, mask and times.
     """
-    return smooth_frames(FrameSmoother(measured, regularize.Smoother() if smoother is None else smoother), progress)
+    frames = FrameSmoother(measured, regularize.Smoother() if smoother is None else smoother)
+    frames.warn()
+    return smooth_frames(frames, progress)
 
 
 def smooth_frames(frames: FrameSmoother, progress: bool = False) -> geometry.Recording:

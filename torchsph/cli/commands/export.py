@@ -10,9 +10,10 @@ import geometry
 from geometry.formats import EXPORTS
 from geometry.formats import export as export_files
 
+from ..command import Command
 
-def describe(parser: argparse.ArgumentParser, _: tuple[str, ...]) -> None:
-    """Write a recording for ParaView, 3D Slicer, MATLAB or xarray."""
+
+def _arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("file", metavar="FILE.h5", help="a recording")
     parser.add_argument("--to", required=True, choices=tuple(EXPORTS), help="the format")
     parser.add_argument("--out", metavar="NAME", help="of the main file (as FILE, beside it)")
@@ -25,3 +26,6 @@ def export(args: argparse.Namespace) -> None:
     written = export_files(recording, target, args.to)
     more = f" and {len(written) - 1} more beside it" if len(written) > 1 else ""
     print(f"wrote {written[0]}{more}", file=sys.stderr)
+
+
+COMMAND = Command("export", "Write a recording for ParaView, 3D Slicer, MATLAB or xarray.", _arguments, export)

@@ -12,13 +12,14 @@ from numpy.typing import NDArray
 
 import geometry
 from torchsph import __version__
-from torchsph.evaluation.metrics import filled_velocity, matching_frames
+from torchsph.evaluation.frames import matching_frames
+from torchsph.evaluation.metrics import filled_velocity
 from torchsph.haemodynamics.beat import BEAT_UNITS, beat_numbers
 from torchsph.haemodynamics.quantities import UNITS, FlowDomain, flow_quantities
 
-from .outputs import output_folder, staged, write_json
-
-__all__ = ["quantify"]
+from ..arguments import add_output_folder
+from ..command import Command
+from ..outputs import output_folder, staged, write_json
 
 Curves = dict[str, NDArray[np.float64]]
 
@@ -28,12 +29,17 @@ CAUTION = (
 )
 
 
+def _arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("analysis", metavar="ANALYSIS.h5", help="velocities: an analysis, a measurement, a truth")
+    parser.add_argument("--truth", metavar="TRUTH.h5", help="the true flow, to compare with")
+    add_output_folder(parser)
+
+
 def quantify(args: argparse.Namespace) -> None:
     """`torchsph quantify`: every scalar of one recording, beside the truth's where there is one."""
     folder = output_folder(args.out)
     recording = geometry.read_recording(args.analysis)
-    if recording.beam is not None:
-        raise ValueError(f"{args.analysis}: /beam: holds one component along a beam; quantities need full vectors")
+    geometry.measurement_type(recording).require_full(f"{args.analysis}: quantities need")
     fields = {"analysis": _curves(recording)}
     if args.truth is not None:
         truth = geometry.read_recording(args.truth)
@@ -85,3 +91,11 @@ def _table(fields: Mapping[str, Curves], numbers: Mapping[str, Curves]) -> list[
         error = [f"{values[0] - values[1]:+.3g}"] if compared else []
         rows.append([name, unit, *(f"{value:.4g}" if np.isfinite(value) else "-" for value in values), *error])
     return rows
+
+
+COMMAND = Command(
+    "quantify",
+    "Pressure, energy, forces and flow rates of a recording, over time and over the beat.",
+    _arguments,
+    quantify,
+)

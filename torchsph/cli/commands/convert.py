@@ -11,7 +11,8 @@ import geometry
 from geometry.formats import FORMATS, FieldMap, WallOptions, read_field_map
 from geometry.formats import convert as convert_files
 
-from .findings import tell_findings
+from ..command import Command
+from ..findings import tell_findings
 
 STRINGS = {
     "mask": "array that is above a half in the blood",
@@ -32,12 +33,7 @@ NUMBERS = {
 }
 
 
-def describe(parser: argparse.ArgumentParser, _: tuple[str, ...]) -> None:
-    """Make a recording from a lab's own files.
-
-    What the files say is taken from them: axes, directions, units, times. What they do not say is asked for
-    in one line that names the option.
-    """
+def _arguments(parser: argparse.ArgumentParser) -> None:
     names = ", ".join(one.name for one in FORMATS)
     parser.add_argument("inputs", nargs="+", metavar="INPUT", help="velocity in one or several files, or surfaces")
     parser.add_argument("--out", required=True, metavar="M.h5", help="the recording")
@@ -104,3 +100,14 @@ def _numbers(text: str) -> str | tuple[float, ...]:
         return tuple(float(part) for part in text.split(","))
     except ValueError:
         return text
+
+
+COMMAND = Command(
+    "convert",
+    """Make a recording from a lab's own files.
+
+    What the files say is taken from them: axes, directions, units, times. What they do not say is asked for
+    in one line that names the option.""",
+    _arguments,
+    convert,
+)

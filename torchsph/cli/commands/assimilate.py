@@ -1,0 +1,167 @@
+"""`torchsph assimilate`: methods on one measurement, scored, drawn and written."""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import geometry
+from torchsph import data
+from torchsph.assimilation import filter_figure
+from torchsph.evaluation import figures, metrics
+from torchsph.evaluation.scores import Scores
+from torchsph.methods import by_name
+from torchsph.methods.runtime import parallel
+
+from ..arguments import add_model_options, add_output_folder, add_seed, names, whole
+from ..checks import check_spacing, usable_device
+from ..command import Command
+from ..outputs import output_folder, staged, write_json
+from ..printing import print_table, run_config, say
+
+
+def _arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("measurement", nargs="?", metavar="MEASUREMENT.h5", help="a recording with /weight or /sigma")
+    parser.add_argument("--truth", metavar="TRUTH.h5", help="the true flow, to compute errors against")
+    parser.add_argument("--method", type=names, metavar="NAME[,NAME]", help="free, spline, sph, ensemble")
+    parser.add_argument(
+        "--also",
+        action="append",
+        default=[],
+        metavar="FILE.h5",
+        help="a further measurement of the same beat, with its own grid, times and errors (repeatable)",
+    )
+    add_model_options(parser)
+    parser.add_argument("--members", type=whole(2), metavar="N", help="size of the ensemble")
+    parser.add_argument(
+        "--lag", type=whole(1), metavar="N", help="frames whose data still move the ensemble's earlier analyses (off)"
+    )
+    parser.add_argument("--resume", action="store_true", help="go on with the ensemble where DIR/checkpoint.pt left it")
+    add_seed(parser)
+    add_output_folder(parser)
+
+
+def assimilate(args: argparse.Namespace) -> None:
+    """`torchsph assimilate`: every asked method on one measurement, scored, drawn and written.
+
+    Under torchrun the processes share the ensemble's simulations; the first one writes and prints.
+    """
+    measured_path, truth_path, methods = _inputs(args)
+    folder, device = output_folder(args.out), parallel.own_device(usable_device(args.device))
+    measured = geometry.read_recording(measured_path)
+    also = [geometry.read_recording(path) for path in args.also]
+    truth = None if truth_path is None else geometry.read_recording(truth_path)
+    check_spacing(args.spacing, measured)
+    raw = metrics.evaluate(measured, truth, measured)  # first: a truth that does not fit must not cost a run
+    saved = folder / "checkpoint.pt"
+    with parallel.joined():
+        results = by_name.run_methods(
+            measured,
+            methods,
+            preset=args.preset,
+            spacing=args.spacing,
+            members=args.members,
+            lag=args.lag,
+            also=also,
+            truth=truth,
+            checkpoints=saved,
+            resume=args.resume,
+            seed=args.seed,
+            device=device,
+            progress=parallel.is_lead(),
+        )
+    if not parallel.is_lead():
+        return
+    chosen = by_name.DEFAULT_METHOD if by_name.DEFAULT_METHOD in methods else methods[0]
+    config = run_config(args, measured=measured_path, truth=truth_path, methods=methods, analysis=chosen)
+    _write(folder, measured, truth, results, raw, config)
+    saved.unlink(missing_ok=True)  # the run is complete: there is nothing to go on with
+
+
+def _write(
+    folder: Path,
+    measured: geometry.Recording,
+    truth: geometry.Recording | None,
+    results: Mapping[str, by_name.MethodResult],
+    raw: Scores,
+    config: dict[str, Any],
+) -> None:
+    """Score, draw and write the results; print what they are worth.
+
+    Args:
+        folder: of the files.
+        measured: the measurement.
+        truth: to compare with, or None.
+        results: of each method.
+        raw: the measurement's own scores.
+        config: what was asked for.
+    """
+    analyses = {name: result.recording for name, result in results.items()}
+    scores = {"raw": raw} | {name: metrics.evaluate(each, truth, measured) for name, each in analyses.items()}
+    seconds = {name: result.seconds for name, result in results.items()}
+    config["info"] = {name: result.info for name, result in results.items()}
+    if truth is not None:
+        claims = {name: metrics.spread_over_skill(recording, truth) for name, recording in analyses.items()}
+        config["spread_over_skill"] = {name: claim.value for name, claim in claims.items() if claim is not None}
+    with staged(folder) as scratch:
+        for name, recording in analyses.items():
+            geometry.write_recording(scratch / f"{name}.h5", recording)
+        shutil.copyfile(scratch / f"{config['analysis']}.h5", scratch / "analysis.h5")
+        figures.draw_report(scratch / "report.png", measured, analyses, scores, truth, seconds)
+        if "ensemble" in results:
+            filter_figure(results["ensemble"].info["filter"]).savefig(scratch / "filter.png", dpi=110)
+        write_json(scratch / "metrics.json", metrics_document(measured, scores, seconds, config))
+    print_table(figures.scores_table(scores, seconds))
+    for words in results["ensemble"].info["filter"]["warnings"] if "ensemble" in results else ():
+        say(f"ensemble: {words}")
+    files = ", ".join(f"{name}.h5" for name in analyses)
+    say(f"wrote {files}, analysis.h5 (= {config['analysis']}.h5), report.png and metrics.json to {folder}/")
+
+
+def _inputs(args: argparse.Namespace) -> tuple[Path, Path | None, tuple[str, ...]]:
+    """The measurement's file, the truth's, and the methods that are run."""
+    truth: Path | None
+    if args.measurement is None:
+        if args.truth is not None:
+            raise ValueError("--truth needs MEASUREMENT.h5 (without it the sample runs, which has its own truth)")
+        measured, truth = Path(data.sample_measurement()), Path(data.sample_truth())
+        methods = args.method or tuple(by_name.METHODS)
+    else:
+        measured, truth = Path(args.measurement), None if args.truth is None else Path(args.truth)
+        methods = args.method or (by_name.DEFAULT_METHOD,)
+    unknown = [name for name in methods if name not in by_name.METHODS]
+    if unknown:
+        raise ValueError(f"--method: unknown {', '.join(unknown)}; known are {', '.join(by_name.METHODS)}")
+    return measured, truth, methods
+
+
+def metrics_document(
+    measured: geometry.Recording,
+    scores: Mapping[str, Scores],
+    seconds: Mapping[str, float],
+    config: Mapping[str, Any],
+) -> dict[str, Any]:
+    """The content of `metrics.json`; the row `raw` is the measurement itself."""
+    return {
+        "methods": {name: {key: one.value for key, one in score.items()} for name, score in scores.items()},
+        "per_frame": {
+            name: {"time": measured.time} | {key: one.per_frame for key, one in score.items()}
+            for name, score in scores.items()
+        },
+        "seconds": dict(seconds),
+        "config": dict(config),
+    }
+
+
+COMMAND = Command(
+    "assimilate",
+    """Turn a noisy measured recording into analysed velocity fields.
+
+    Without a file, every method runs on the sample that ships with the package; with a file and no --method,
+    the default method alone.""",
+    _arguments,
+    assimilate,
+)

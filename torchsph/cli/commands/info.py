@@ -1,0 +1,84 @@
+"""`torchsph info`: a recording in a few lines, or the pair kernels of this machine."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+
+import geometry
+from torchsph.evaluation import metrics
+
+from ..command import Command
+from ..findings import tell_findings
+from ..printing import print_table
+
+
+def _arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("file", nargs="?", metavar="FILE")
+    parser.add_argument("--backends", action="store_true", help="list the pair kernels of this machine")
+    parser.add_argument("--strict", action="store_true", help="refuse whatever else is odd about the recording")
+
+
+def info(args: argparse.Namespace) -> None:
+    """`torchsph info`: a recording in a few lines, or the pair kernels of this machine."""
+    if args.file is None and not args.backends:
+        raise ValueError("info needs a FILE to look at, or --backends")
+    if args.backends:
+        from torchsph.pairs.registry import available_backends
+
+        devices = ("cpu", "cuda") if torch.cuda.is_available() else ("cpu",)
+        rows = [
+            [one.name, device, "yes" if one.present else "no", one.reason]
+            for device in devices
+            for one in available_backends(device)
+        ]
+        print_table([["backend", "device", "present", "why"], *rows], text=True)
+    if args.file is not None:
+        recording = geometry.read_recording(args.file)
+        print_table(summary_table(recording), text=True)
+        tell_findings(recording, args.file, strict=args.strict)
+
+
+def summary_table(recording: geometry.Recording) -> list[list[str]]:
+    """What a recording holds, as rows of name and value."""
+    time, grid = np.asarray(recording.time), recording.grid
+    speed = np.linalg.norm(metrics.filled_velocity(recording), axis=1)[np.asarray(recording.mask, bool)]
+    intervals = recording.valve_intervals_or_derived()
+    optional = ("weight", "sigma", "uncovered", "beam", "pressure", "volume", "flux_mitral", "flux_aortic")
+    present = [name for name in optional if getattr(recording, name) is not None]
+    rows = [
+        ["recording", "valid"],
+        ["description", recording.description or "-"],
+        ["dimension", str(recording.dimension)],
+        ["frames", f"{len(time)}, {time[0]:g} to {time[-1]:g} s"],
+        ["grid", f"{' x '.join(str(n) for n in reversed(grid.shape))} nodes, spacing {_mm(grid.spacing)} mm"],
+        ["fluid", f"{recording.rho:g} kg/m3, {1e3 * recording.mu:g} mPa s"],
+        ["mask", f"{len(speed) / len(time):.0f} nodes in the blood per frame"],
+        ["speed", f"RMS {_rms(speed):.3g}, highest {speed.max(initial=0):.3g} m/s"],
+        ["wall", _wall_text(recording.wall)],
+        ["also holds", ", ".join(present) or "-"],
+    ]
+    for region, opening, closing in [] if intervals is None else intervals:
+        rows.append([f"orifice {int(region)}", f"open {1e3 * opening:g} to {1e3 * closing:g} ms"])
+    return rows
+
+
+def _wall_text(wall: geometry.Wall | None) -> str:
+    if wall is None:
+        return "-"
+    regions = {int(label): int(n) for label, n in zip(*np.unique(wall.region, return_counts=True), strict=True)}
+    return f"{wall.vertices.shape[-2]} vertices, faces by region {regions}"
+
+
+def _mm(lengths: Sequence[float]) -> str:
+    return " x ".join(f"{1e3 * length:g}" for length in lengths)
+
+
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(values.astype(np.float64) ** 2))) if values.size else 0.0
+
+
+COMMAND = Command("info", "Check a recording against the format and summarise it.", _arguments, info)

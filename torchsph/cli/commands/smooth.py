@@ -1,0 +1,32 @@
+"""`torchsph smooth`: a B-spline field for each frame of a measurement."""
+
+from __future__ import annotations
+
+import argparse
+
+import geometry
+from torchsph.evaluation import figures, metrics
+from torchsph.methods.measurement.frame_splines import smooth as smooth_recording
+
+from ..checks import full_vectors, output_file
+from ..command import Command
+from ..printing import print_table, say
+
+
+def _arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("measurement", metavar="MEASUREMENT.h5")
+    parser.add_argument("--out", required=True, metavar="SMOOTH.h5", help="the smoothed recording")
+
+
+def smooth(args: argparse.Namespace) -> None:
+    """`torchsph smooth`: a B-spline field for each frame."""
+    path = output_file(args.out)
+    measured = full_vectors(geometry.read_recording(args.measurement), args.measurement)
+    smoothed = smooth_recording(measured, progress=True)
+    geometry.write_recording(path, smoothed)
+    scores = {name: metrics.evaluate(one, None, measured) for name, one in (("raw", measured), ("spline", smoothed))}
+    print_table(figures.scores_table(scores, {}))
+    say(f"wrote {len(smoothed.time)} frames to {path}")
+
+
+COMMAND = Command("smooth", "Fit a B-spline field to each frame of a measurement.", _arguments, smooth)

@@ -1,0 +1,32 @@
+"""What a command prints: a small table on stdout, notes on stderr; and the account of a run for its files."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+
+from torchsph import __version__
+
+
+def run_config(args: argparse.Namespace, **extra: Any) -> dict[str, Any]:
+    """What was asked for, with versions, for `metrics.json`; ``extra`` goes over what has its name."""
+    options = {name: value for name, value in vars(args).items() if name not in ("run", "measurement", "method")}
+    return {"torchsph": __version__, "torch": torch.__version__, **options, **extra}
+
+
+def print_table(rows: Sequence[Sequence[str]], text: bool = False) -> None:
+    """Columns lined up: the first to the left, numbers to the right."""
+    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
+    for row in rows:
+        first, *rest = zip(row, widths, strict=True)
+        cells = [first[0].ljust(first[1])] + [c.ljust(w) if text else c.rjust(w) for c, w in rest]
+        print("  ".join(cells).rstrip())
+
+
+def say(message: str) -> None:
+    """A note, on stderr."""
+    print(message, file=sys.stderr)

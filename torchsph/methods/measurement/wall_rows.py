@@ -1,0 +1,84 @@
+"""Walls and valves of a recording as the spline smoother's rows."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+import geometry
+from regularize import WallRows
+
+POINTS_PER_KNOT = 4  # on the wall, along a knot distance
+MANY = 4  # times as many faces as such points are worth replacing
+FEWEST = 1000  # points below which it saves nothing
+
+
+def open_regions(recording: geometry.Recording, time: float) -> tuple[int, ...]:
+    """Regions of the orifices that are open at ``time`` (s), in ascending order."""
+    rows = recording.valve_intervals_or_derived()
+    present = set(np.unique(recording.wall_for("open orifices").region).tolist())
+    return tuple(sorted({int(r) for r, opens, closes in rows if opens <= time < closes and int(r) in present}))
+
+
+def at_knots(motion: geometry.WallMotion, knots: float) -> tuple[geometry.WallMotion, geometry.WallSampler | None]:
+    """The wall with as many points as knots of a distance ``knots`` (m) can tell apart.
+
+    The midpoint rule over the faces is exact in the flux and good enough while no edge is longer than the knots, so
+    that coarser faces are cut. Where there are several times more faces than points a quarter of the knots apart, such
+    points stand for them: rows cost time, and a scan may have hundreds of thousands of faces.
+    """
+    surface = motion.surface(float(motion.time[0]))
+    corner = surface.vertices[surface.faces]
+    longest = float(np.linalg.norm(corner - np.roll(corner, 1, axis=1), axis=2).max())
+    if longest > knots:
+        return geometry.refined_motion(motion, knots), None
+    step = knots / POINTS_PER_KNOT
+    if len(surface.faces) > MANY * max(surface.area / step ** (surface.dimension - 1), FEWEST):
+        return motion, geometry.WallSampler(motion, step)
+    return motion, None
+
+
+def wall_rows(
+    recording: geometry.Recording,
+    motion: geometry.WallMotion,
+    frame: int,
+    *,
+    at_rest: bool = False,
+    sampler: geometry.WallSampler | None = None,
+) -> WallRows:
+    """One row per wall point at a frame, weighted by area.
+
+    An orifice that alone is open carries the flux dV/dt as a plug. Where several are open, how they share it is for the
+    data to say: they have no rows, and that their fluxes sum to dV/dt follows from the rows of the shut wall and of the
+    divergence.
+
+    Args:
+        recording: whose frame and valves it is.
+        motion: of its wall.
+        frame: its number.
+        at_rest: every velocity zero, the rows of an increment between two fields that both obey the walls.
+        sampler: points on the wall; None: one in the middle of each face, with its exact area and normal.
+    """
+    time = float(recording.time[frame])
+    surface = motion.surface(time)
+    if sampler is None:
+        speed = motion.velocity(time)[surface.faces].mean(1)
+        points = geometry.WallPoints(surface.centroids, surface.normals, speed, surface.areas, surface.region)
+    else:
+        points = sampler.at(time)
+    velocity, regions = points.velocities, open_regions(recording, time)
+    if len(regions) == 1:
+        vector = surface.area_vectors[surface.part(regions[0])].sum(0)
+        area = float(np.linalg.norm(vector))
+        velocity[points.region == regions[0]] += -motion.volume_rate(time) / area * vector / area
+    no_slip = ~np.isin(points.region, regions)
+    good = (points.areas > 0) & (no_slip | (len(regions) == 1))
+
+    def tensor(values: np.ndarray) -> torch.Tensor:
+        return torch.from_numpy(np.ascontiguousarray(values[good]))
+
+    if at_rest:
+        velocity = np.zeros_like(velocity)
+    return WallRows(
+        tensor(points.points), tensor(points.normals), tensor(velocity), tensor(points.areas), tensor(no_slip)
+    )
