@@ -35,7 +35,7 @@ manifest_maker.template = ".build/MANIFEST.in"
 # the script whose build(folder) compiles, and the package folder that the libraries go to
 NATIVE = (
     ("torchsph/native/build.py", "torchsph/native/libraries"),
-    ("regularize/native/build.py", "regularize/native"),
+    ("regularize/native/build.py", "regularize/native/libraries"),
 )
 
 

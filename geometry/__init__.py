@@ -1,12 +1,17 @@
 """Recordings, regular grids, closed surfaces and their signed distance, moving walls, ventricle shapes."""
 
 from .grids.grid import Grid, Stencil
+from .motion.estimates import Estimates, estimated
 from .motion.moving_distance import MovingDistance, WallField, WallPoint
 from .motion.orifices import Orifice, OrificePlane, orifices
 from .motion.refine import refined, refined_motion
+from .motion.valve_times import ValveTimes, find_valve_times
+from .motion.wall_estimate import WallEstimate, estimate_wall
 from .motion.wall_motion import WallMotion
 from .motion.wall_points import WallPoints, WallSampler, wall_points
+from .recordings.checks import findings
 from .recordings.errors import RecordingError
+from .recordings.finding import Finding
 from .recordings.read import read_recording
 from .recordings.recording import Recording, Wall
 from .recordings.rules import check_recording
@@ -14,6 +19,7 @@ from .recordings.write import write_recording
 from .surfaces.closest import Closest, SurfaceIndex
 from .surfaces.distance import GridDistance, distance_and_closest, signed_distance
 from .surfaces.files import labelled, read_surface, write_surface
+from .surfaces.openings import Opening, openings, with_lids
 from .surfaces.repair import repaired
 from .surfaces.segmentation import surface_from_mask, surface_from_points, surface_from_velocity, taubin
 from .surfaces.shapes import box, ellipse, ellipsoid, polygon, revolved, tube
@@ -24,9 +30,12 @@ from .ventricle.ventricle import Beat, Ventricle
 __all__ = [
     "Beat",
     "Closest",
+    "Estimates",
+    "Finding",
     "Grid",
     "GridDistance",
     "MovingDistance",
+    "Opening",
     "Orifice",
     "OrificePlane",
     "Recording",
@@ -35,8 +44,10 @@ __all__ = [
     "Surface",
     "SurfaceError",
     "SurfaceIndex",
+    "ValveTimes",
     "Ventricle",
     "Wall",
+    "WallEstimate",
     "WallField",
     "WallMotion",
     "WallPoint",
@@ -47,8 +58,13 @@ __all__ = [
     "distance_and_closest",
     "ellipse",
     "ellipsoid",
+    "estimate_wall",
+    "estimated",
+    "find_valve_times",
+    "findings",
     "grid_winding",
     "labelled",
+    "openings",
     "orifices",
     "polygon",
     "read_recording",
@@ -65,6 +81,7 @@ __all__ = [
     "tube",
     "wall_points",
     "winding_number",
+    "with_lids",
     "write_recording",
     "write_surface",
 ]

@@ -23,6 +23,7 @@ def _prefer_installed() -> None:
 _prefer_installed()
 
 import numpy as np  # noqa: E402
+from paths import SHARED_DATA  # noqa: E402
 
 import geometry  # noqa: E402
 
@@ -30,6 +31,15 @@ import geometry  # noqa: E402
 def pytest_report_header() -> str:
     """Say which copy of the packages is under test."""
     return f"packages under test: {Path(geometry.__file__).resolve().parents[1]}"
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Skip, with the reason, what needs a file of the phantom that this machine lacks: see the marker `phantom`."""
+    for marker in item.iter_markers("phantom"):
+        missing = [name for name in marker.args if not (SHARED_DATA / name).is_file()]
+        if missing or not marker.args:
+            assert marker.args, f"{item.nodeid}: the marker phantom names the files that are needed"
+            pytest.skip(f"needs {', '.join(missing)} in {SHARED_DATA}: the phantom lies beside the checkout, not in it")
 
 
 def box_surface(dimension: int, size: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -4,7 +4,6 @@ An SPH simulator, incompressible or weakly compressible, is the forecast model, 
 and an ensemble filter joins forecasts and measurements.
 """
 
-from ._version import __version__
 from .methods.by_name import DEFAULT_METHOD, METHODS, MethodResult, forecast_skill, make_model, run_methods
 from .methods.ensemble.assimilate import EnsembleRun, assimilate, default_filter
 from .methods.ensemble.options import EnsembleOptions, Estimated
@@ -12,24 +11,22 @@ from .methods.frame_splines import smooth
 from .methods.measurement.error_model import ObservationError, estimate_error
 from .methods.nudging import FilteredRun, filter_sph
 from .pairs.smoothing_kernels import KERNELS, SmoothingKernel, kernel
+from .simulator.failures import NumericalFailure
 from .simulator.grid_forecast import ForecastSkill, GridForecast, Transfer, skill
-from .simulator.population import PopulationControl
+from .simulator.residual_motion import ResidualMotion, residual_motion
 from .simulator.scene import Fluid, Scene, Valve
+from .simulator.schemes.parts import XSPH, GammaRamp, Rollback
+from .simulator.schemes.population_control import PopulationControl
 from .simulator.schemes.presets import PRESETS, preset
 from .simulator.schemes.projection import Projection
-from .simulator.schemes.weakly_compressible import (
-    XSPH,
-    CompleteKernelWall,
-    GammaRamp,
-    PotentialWall,
-    PressureSource,
-    Reservoir,
-    Rollback,
-    WeaklyCompressible,
-)
-from .simulator.seeding import ResidualMotion, Seeding, residual_motion
-from .simulator.simulation import NumericalFailure, Simulation
+from .simulator.schemes.valve_models import PressureSource, Reservoir
+from .simulator.schemes.wall_models import CompleteKernelWall, PotentialWall
+from .simulator.schemes.weakly_compressible import WeaklyCompressible
+from .simulator.seeding import Seeding
+from .simulator.simulation import Simulation
 from .simulator.simulator import Simulator
+
+__version__ = "0.1.0"  # the one place: pyproject.toml reads it from here, without importing
 
 __all__ = [
     "DEFAULT_METHOD",

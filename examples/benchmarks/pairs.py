@@ -28,9 +28,9 @@ import torch
 
 from torchsph import Fluid, Scene, Simulator, WeaklyCompressible
 from torchsph.native.library import library
-from torchsph.pairs import Backend, MomentumTerms, PairState, RateTerms, Support, available_backends, backend
-from torchsph.pairs.interface import square_length
+from torchsph.pairs import Backend, MomentumTerms, PairState, RateTerms, Support, available_backends, choose_backend
 from torchsph.pairs.smoothing_kernels import kernel
+from torchsph.pairs.vectors import square_length
 
 LENGTH = 1.2
 SUPPORT = Support(kernel("wendland_c2"), LENGTH, 3)
@@ -210,7 +210,7 @@ def engines() -> dict[str, Backend]:
     found = {}
     for status in available_backends():
         if status.present:
-            found[status.name] = backend(status.name)
+            found[status.name] = choose_backend(status.name)
         else:
             print(f"backend '{status.name}' is not measured: {status.reason}", file=sys.stderr)
     return found

@@ -87,7 +87,7 @@ from torchsph import (
     skill,
 )
 from torchsph.data import sample_truth
-from torchsph.simulator.schemes.presets import Scheme
+from torchsph.simulator.schemes.scheme import Scheme
 from torchsph.validation.runs import taylor_green, taylor_green_error
 
 LEADS = (0.01, 0.04)  # s

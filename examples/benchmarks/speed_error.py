@@ -53,7 +53,7 @@ from walls import steady_pipe
 import geometry
 from torchsph import GammaRamp, PotentialWall, Projection, Scene, Simulator, WeaklyCompressible, preset, skill
 from torchsph.data import sample_truth
-from torchsph.simulator.schemes.presets import Scheme
+from torchsph.simulator.schemes.scheme import Scheme
 from torchsph.validation import exact_flows as validation
 from torchsph.validation.ellipsoid import PulsatingEllipsoid
 from torchsph.validation.runs import channel, channel_error, kinetic_energy, taylor_green, taylor_green_error

@@ -49,8 +49,9 @@ import geometry
 from torchsph import CompleteKernelWall, PotentialWall, Scene, Simulator, WeaklyCompressible
 from torchsph.pairs.smoothing_kernels import kernel
 from torchsph.simulator.scene import Fluid
-from torchsph.simulator.schemes.presets import Scheme
+from torchsph.simulator.schemes.scheme import Scheme
 from torchsph.simulator.simulation import Simulation
+from torchsph.simulator.surroundings import PresentSurroundings
 from torchsph.simulator.walls import closest as wall_closest
 from torchsph.simulator.walls.fields import WallFields
 from torchsph.validation import exact_wall_flows as validation_walls
@@ -148,11 +149,10 @@ def part_of_step(wall: object, across: int, steps: int) -> dict[str, float]:
         return (time.process_time() - began) / int(run.record.steps)
 
     seconds()
-    domain = simulator.domain
     taken: dict[bool, list[float]] = {True: [], False: []}
     for _ in range(5):
         taken[True].append(seconds())
-        with mock.patch.object(domain, "sample", lambda particles: None):
+        with mock.patch.object(PresentSurroundings, "sample", lambda surroundings, particles: None):
             taken[False].append(seconds())
     both, alone = (float(np.median(taken[key])) for key in (True, False))
     return {"particles": start.count, "step_s": both, "part": 1 - alone / both}
@@ -169,12 +169,12 @@ def fields(repeats: int) -> dict[str, float]:
     for name, closest in (("compiled", wall_closest.closest_on_grid), ("k-d tree", wall_closest.closest_by_tree)):
         made = WallFields(motion, 1e-3, 1.0, kernel("wendland_c2"), 1.3, True, "cpu", torch.float32)
         made.key(0, ())
-        moments = range(1, len(made.moments.times))
+        numbers = range(1, len(made.key_times.times))
         with mock.patch("torchsph.simulator.walls.fields.closest_on_grid", closest):
             began = time.process_time()
-            for moment in moments:
-                made.key(moment, ())
-            result[name] = (time.process_time() - began) / len(moments)
+            for number in numbers:
+                made.key(number, ())
+            result[name] = (time.process_time() - began) / len(numbers)
         result["nodes"] = made.grid.size
     return result
 

@@ -10,23 +10,37 @@ import numpy as np
 
 from geometry.grids.grid import Grid
 
+from .checks import refuse_implausible
 from .errors import RecordingError
 from .recording import LAYOUT, OF_A_WALL, REQUIRED, Recording, Wall
 from .rules import check_recording
+from .units import factor
 
 ELSEWHERE = "in another file, which is never followed; copy the data into this file"
 # HDF5 filters: deflate (gzip), shuffle, fletcher32, lzf. Others would load code from plug-ins.
 FILTERS = {1, 2, 3, 32000}
+# Datasets whose attribute `units` is obeyed, and what they are.
+QUANTITIES = {
+    "/time": "time",
+    "/velocity": "velocity",
+    "/sigma": "velocity",
+    "/pressure": "pressure",
+    "/wall/vertices": "length",
+    "/wall/velocity": "velocity",
+}
 SOFT_LINKS = 16  # a chain longer than this is a circle
 
 
 def read_recording(path: str | Path) -> Recording:
     """Read and validate a recording file.
 
-    Raises FileNotFoundError where there is no file, and RecordingError, which names the file, the dataset,
-    the rule and what to do, where it is not a recording or breaks one of the rules. External links, external
-    storage and virtual datasets are refused. The velocity comes back as 0 outside the mask, and may be NaN
-    where the weight is 0.
+    External links, external storage and virtual datasets are refused. The velocity comes back as 0 outside the mask,
+    and may be NaN where the weight is 0.
+
+    Raises:
+        FileNotFoundError: there is no file.
+        RecordingError: it is not a recording or breaks one of the rules; the text names the file, the dataset, the
+            rule and what to do.
     """
     path = Path(path)
     if not path.is_file():
@@ -42,6 +56,7 @@ def read_recording(path: str | Path) -> Recording:
         except OSError as fault:
             raise RecordingError(source, "file", f"is damaged: {fault}") from fault
     check_recording(recording, source)
+    refuse_implausible(recording, source)
     recording.velocity[~np.broadcast_to(recording.mask[:, None], recording.velocity.shape)] = 0
     return recording
 
@@ -169,11 +184,41 @@ def _load(node: h5py.Group | h5py.Dataset, dataset: str, kind: type, source: str
     for code, _, _, name in (settings.get_filter(number) for number in range(settings.get_nfilters())):
         if code not in FILTERS:
             raise RecordingError(source, dataset, f"is stored through {name!r}; use gzip, lzf or no compression")
-    values = np.asarray(node[()])
+    values = _unpacked(node, np.asarray(node[()]), dataset, source)
     if kind in (np.bool_, np.int32, np.uint8, np.int64):
         _check_integers(values, dataset, kind, source)
     with np.errstate(over="ignore"):  # a float64 too large for float32 becomes inf, which the rules then report
         return values.astype(kind)
+
+
+def _unpacked(node: h5py.Dataset, values: np.ndarray, dataset: str, source: str) -> np.ndarray:
+    """Values in SI units: `scale_factor`, `add_offset`, `_FillValue` (CF 1.11, 2023, sec. 8.1) and `units` applied."""
+    scale = [_packing(node, name, dataset, source) for name in ("scale_factor", "add_offset", "_FillValue")]
+    if scale[0] is None and scale[1] is None:
+        if dataset in QUANTITIES and values.dtype.kind in "iu" and values.any():
+            rule = "holds integers without an attribute scale_factor; they are packed or in another unit than SI"
+            raise RecordingError(source, dataset, f"{rule}: store floating-point numbers")
+    else:
+        plain = values * np.float64(1.0 if scale[0] is None else scale[0]) + (scale[1] or 0.0)
+        values = plain if scale[2] is None else np.where(values == scale[2], np.nan, plain)
+    units = node.attrs.get("units")
+    if units is None or dataset not in QUANTITIES:
+        return values
+    text = units.decode("utf-8", "replace") if isinstance(units, bytes) else str(units)
+    try:
+        unit = factor(text, QUANTITIES[dataset])
+    except ValueError as fault:
+        raise RecordingError(source, dataset, f"its attribute units: {fault}") from fault
+    return values if unit == 1 else values * unit
+
+
+def _packing(node: h5py.Dataset, name: str, dataset: str, source: str) -> float | None:
+    if name not in node.attrs:
+        return None
+    value = np.asarray(node.attrs[name])
+    if value.size != 1 or value.dtype.kind not in "fiu":
+        raise RecordingError(source, dataset, f"its attribute {name} must be one number, not {node.attrs[name]!r}")
+    return float(value.reshape(()))
 
 
 def _check_integers(values: np.ndarray, dataset: str, kind: type, source: str) -> None:

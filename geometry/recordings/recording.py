@@ -7,7 +7,7 @@ drops the z axis.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -40,6 +40,10 @@ LAYOUT: tuple[tuple[str, str, type], ...] = (
 )
 REQUIRED = ("/time", "/velocity", "/mask")
 OF_A_WALL = ("/wall/vertices", "/wall/faces", "/wall/region")  # all of them, or no wall at all
+
+
+# what `Recording.check` goes through: `rules` enters itself here, because it has to know recordings
+RULES: list[Callable[[Recording, str], None]] = []
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,6 +169,18 @@ class Recording:
             rule = "is not in this recording; geometry.surface_from_mask makes a surface of the mask"
             raise RecordingError(purpose, "/wall", rule)
         return self.wall
+
+    def check(self, source: str = "recording") -> None:
+        """Test every rule of the format.
+
+        Args:
+            source: what the text of a fault opens with, as a file's name.
+
+        Raises:
+            RecordingError: the first rule that is broken.
+        """
+        for rules in RULES:
+            rules(self, source)
 
     def select(self, frames: slice | Sequence[int] | np.ndarray) -> Recording:
         """Some of the frames, in increasing order of time: a slice, frame numbers or a bool for each frame.

@@ -6,12 +6,14 @@ sizes that must agree are invariants of the class (`Recording`), which refuses t
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 
 from geometry.surfaces.surface import SurfaceError
 
 from .errors import RecordingError
-from .recording import Recording
+from .recording import RULES, Recording
 
 FASTEST = 20.0  # m/s; blood never is as fast, so larger numbers are mm/s or cm/s
 
@@ -40,6 +42,9 @@ def check_recording(recording: Recording, source: str = "recording") -> None:
         _series,
     ):
         rule(recording, source)
+
+
+RULES.append(check_recording)
 
 
 def measured_nodes(recording: Recording) -> np.ndarray:
@@ -184,5 +189,5 @@ def _first(bad: np.ndarray) -> str:
     return f"frame {frame}, node {tuple(node)} (array order)"
 
 
-def _box(lower, upper) -> str:
+def _box(lower: Iterable[float], upper: Iterable[float]) -> str:
     return " x ".join(f"[{a:.4g}, {b:.4g}]" for a, b in zip(lower, upper, strict=True)) + " m"

@@ -1,56 +1,87 @@
-"""Surfaces from and to STL, OBJ and PLY files, by trimesh."""
+"""Surfaces from and to files: STL, OBJ, PLY, VTP."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from .overlap import refuse_overlaps, united
+from .readers.obj import read_obj
+from .readers.ply import read_ply
+from .readers.polygons import PolygonError, Polygons
+from .readers.stl import read_stl
+from .readers.vtk_poly import read_vtk_polygons
 from .repair import repaired
 from .surface import Surface, SurfaceError
 
-if TYPE_CHECKING:
-    import trimesh
-
-SUFFIXES = (".stl", ".obj", ".ply")
+READERS: dict[str, Callable[[Path], Polygons]] = {
+    ".stl": read_stl,
+    ".obj": read_obj,
+    ".ply": read_ply,
+    ".vtp": read_vtk_polygons,
+}
+SUFFIXES = tuple(READERS)
+WRITTEN = (".stl", ".obj", ".ply")
 LARGEST = 1.0  # m; hearts are smaller, so a larger surface is in mm or cm
 
 
-def read_surface(path: str | Path, *, scale: float = 1.0, mend: bool = True) -> Surface:
-    """The triangles of a STL, OBJ or PLY file as a closed outward surface.
+def read_surface(
+    path: str | Path,
+    *,
+    scale: float = 1.0,
+    mend: bool = True,
+    unite: bool = False,
+    hole_region: int | Sequence[int] = 0,
+) -> Surface:
+    """The triangles of a STL, OBJ, PLY or VTP file as a closed outward surface.
 
-    `scale`: metres per unit of the file, 1e-3 for millimetres (these formats do not say). `mend`: merge
-    seams, turn faces, close holes (`repaired`); STL always needs the merging. A PLY face property `region`
-    gives the region labels, otherwise all faces are wall, region 0 (see `labelled`).
+    Args:
+        path: the file. Polygons of more corners are cut into triangles, which keep their polygon's label.
+        scale: metres per unit of the file, 1e-3 for millimetres (these formats do not say).
+        mend: merge seams, turn faces, close holes (`repaired`); STL always needs the merging.
+        unite: closed bodies that overlap become one, with manifold3d; otherwise they are refused.
+        hole_region: label of the faces that close holes; a sequence labels the longest holes, in order.
 
-    Raises FileNotFoundError, and SurfaceError, which names the file, for other formats, files without
-    triangles, surfaces larger than a metre and faults that cannot be mended.
+    Returns:
+        The surface. A face property `region` of a PLY or VTP file gives the labels, otherwise all faces are
+        wall, region 0 (see `labelled`).
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        SurfaceError: names the file, for other formats, files without triangles, surfaces larger than a metre,
+            faults that cannot be mended and bodies that overlap.
     """
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: there is no such file")
-    if path.suffix.lower() not in SUFFIXES:
+    if path.suffix.lower() not in READERS:
         raise SurfaceError(f"{path}: surfaces are read from {', '.join(SUFFIXES)}, not from {path.suffix or 'this'}")
     if not scale > 0:
         raise SurfaceError(f"{path}: scale must be positive (metres per unit of the file), not {scale}")
-    mesh = _load(path)
     try:
-        surface = Surface(np.asarray(mesh.vertices) * scale, mesh.faces, _region(mesh))
+        surface, names = _surface(path, scale)
         lower, upper = surface.bounds
         if (upper - lower).max() > LARGEST:
             size = (upper - lower).max()
             raise SurfaceError(f"is {size:g} m large, so it is probably in mm or cm: pass scale=1e-3 or scale=1e-2")
-        return repaired(surface) if mend else surface
-    except SurfaceError as fault:
+        if not mend:
+            return surface
+        whole = repaired(surface, hole_region=hole_region)
+        if unite:
+            return united(whole)
+        refuse_overlaps(whole, _names_of_pieces(whole, surface, names))
+        return whole
+    except (SurfaceError, PolygonError) as fault:
         raise SurfaceError(f"{path}: {fault}") from fault
 
 
 def write_surface(path: str | Path, surface: Surface, *, scale: float = 1.0) -> None:
     """Write a 3-D surface as STL, OBJ or PLY by suffix, in units of `scale` (m); PLY keeps the regions."""
     path = Path(path)
-    if path.suffix.lower() not in SUFFIXES:
-        raise SurfaceError(f"{path}: surfaces are written to {', '.join(SUFFIXES)}, not to {path.suffix or 'this'}")
+    if path.suffix.lower() not in WRITTEN:
+        raise SurfaceError(f"{path}: surfaces are written to {', '.join(WRITTEN)}, not to {path.suffix or 'this'}")
     mesh = surface.trimesh()
     mesh.vertices = mesh.vertices / scale
     mesh.export(path, file_type=path.suffix.lower()[1:])
@@ -59,10 +90,17 @@ def write_surface(path: str | Path, surface: Surface, *, scale: float = 1.0) -> 
 def labelled(
     surface: Surface, region: int, *, centre: np.ndarray, radius: float, normal: np.ndarray | None = None
 ) -> Surface:
-    """The same surface with the faces within `radius` (m) of `centre` (D,), m, labelled as `region`.
+    """The same surface with the faces around a point labelled.
 
-    Faces belong to it whose centroid lies within the radius and, with a `normal`, whose own normal is within
-    60 degrees of it. Raises SurfaceError where there is none.
+    Args:
+        surface: the surface.
+        region: the new label.
+        centre: (D,), m.
+        radius: m; faces whose centroid lies closer to the centre are labelled.
+        normal: (D,), any length; if given, only faces whose own normal is within 60 degrees of it.
+
+    Raises:
+        SurfaceError: no face is meant.
     """
     away = np.linalg.norm(surface.centroids - np.asarray(centre, np.float64), axis=1)
     chosen = away < radius
@@ -76,23 +114,35 @@ def labelled(
     return Surface(surface.vertices, surface.faces, np.where(chosen, np.uint8(region), surface.region))
 
 
-def _load(path: Path) -> trimesh.Trimesh:
-    import trimesh  # half a second that most uses of the package need not wait
-
-    options = {"skip_materials": True} if path.suffix.lower() == ".obj" else {}
-    try:
-        mesh = trimesh.load_mesh(path, process=False, **options)
-    except Exception as fault:  # each of trimesh's readers has errors of its own kind
-        raise SurfaceError(f"{path}: cannot be read as {path.suffix[1:].upper()} ({fault})") from fault
-    if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
-        raise SurfaceError(f"{path}: holds no triangles")
-    return mesh
+def _surface(path: Path, scale: float) -> tuple[Surface, Sequence[str] | None]:
+    """The file's triangles, m, and the name of the body of each."""
+    polygons = READERS[path.suffix.lower()](path)
+    if len(polygons.sizes) == 0:
+        raise SurfaceError("holds no triangles")
+    faces, owner = polygons.triangles()
+    names = None if polygons.names is None else [polygons.names[number] for number in owner.tolist()]
+    return Surface(polygons.vertices * scale, faces, _labels(polygons.region, owner)), names
 
 
-def _region(mesh: trimesh.Trimesh) -> np.ndarray | None:
-    """Region labels that `write_surface` put into a PLY file."""
-    raw = mesh.metadata.get("_ply_raw", {}).get("face", {}).get("data")
-    if raw is None or "region" not in (raw.dtype.names or ()):
-        return None
-    region = np.asarray(raw["region"]).reshape(-1)
-    return region if len(region) == len(mesh.faces) else None
+def _labels(region: np.ndarray | None, owner: np.ndarray) -> np.ndarray:
+    """Labels of the triangles as whole numbers from 0 to 255."""
+    if region is None:
+        return np.zeros(len(owner), np.uint8)
+    values = np.asarray(region, np.float64).reshape(-1)[owner]
+    if ((values != np.rint(values)) | (values < 0) | (values > 255)).any():
+        raise SurfaceError(f"its face property of regions must hold whole numbers from 0 to 255, not {values.max():g}")
+    return values.astype(np.uint8)
+
+
+def _names_of_pieces(whole: Surface, raw: Surface, names: Sequence[str] | None) -> list[str]:
+    """What the file calls each connected piece, "" where it does not say."""
+    first = np.unique(whole.component_labels, return_index=True)[1]
+    if names is None:
+        return [""] * len(first)
+    known = {tuple(sorted(corner)): name for corner, name in zip(_corners(raw), names, strict=True)}
+    corners = _corners(whole)
+    return [known.get(tuple(sorted(corners[face])), "") for face in first.tolist()]
+
+
+def _corners(surface: Surface) -> list[list[tuple[float, ...]]]:
+    return [[tuple(point) for point in face] for face in surface.vertices[surface.faces].tolist()]

@@ -2,23 +2,29 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components
 from scipy.spatial import cKDTree
 
+from .holes import least_area_triangles, star_shaped
 from .surface import Surface, SurfaceError, ridges_of
 
 
-def repaired(surface: Surface, *, merge: float | None = None, hole_region: int = 0) -> Surface:
+def repaired(surface: Surface, *, merge: float | None = None, hole_region: int | Sequence[int] = 0) -> Surface:
     """The closed, consistently numbered, outward surface that a faulty one was meant to be.
 
     Vertices within `merge` (m; default 1e-7 of the box's diagonal) become one, faces without extent and
     second copies of a face are dropped, neighbours are numbered alike, each hole is closed by a fan of faces
-    (a single edge in a plane) of region `hole_region`, and every piece is turned so that its normals leave
-    the blood. A surface that is sound comes back with the same faces in the same order.
+    (along its rim where that is not star-shaped; a single edge in a plane) of region `hole_region`, and every
+    piece is turned so that its normals leave the blood. A surface that is sound comes back with the same faces
+    in the same order. A sequence of labels is given to the holes in order of the lengths of their rims, the
+    longest first; the holes that are left are wall, region 0.
 
-    Raises SurfaceError where that is not enough, as where three faces meet at an edge.
+    Raises:
+        SurfaceError: that is not enough, as where three faces meet at an edge.
     """
     lower, upper = surface.bounds
     tolerance = 1e-7 * float(np.linalg.norm(upper - lower)) if merge is None else merge
@@ -85,10 +91,12 @@ def _numbered_alike(surface: Surface) -> np.ndarray:
     return np.where(flip[:, None], surface.faces[:, ::-1], surface.faces)
 
 
-def _closed(surface: Surface, region: int) -> Surface:
-    """Every hole closed: in a plane by an edge between the ends, else by a fan around the rim's middle."""
+def _closed(surface: Surface, region: int | Sequence[int]) -> Surface:
+    """Every hole closed: in a plane by an edge between the ends, else by a fan or along its rim."""
     if surface.open_ridges == 0:
         return surface
+    labels = [] if isinstance(region, int) else list(region)
+    rest = region if isinstance(region, int) else 0
     if surface.dimension == 2:
         starts = np.setdiff1d(surface.faces[:, 0], surface.faces[:, 1])
         ends = np.setdiff1d(surface.faces[:, 1], surface.faces[:, 0])
@@ -96,17 +104,32 @@ def _closed(surface: Surface, region: int) -> Surface:
             raise SurfaceError(
                 "the outline cannot be mended: it has several gaps, and which ends belong together is open"
             )
-        return _with_faces(surface, surface.vertices, np.array([[ends[0], starts[0]]]), region)
-    vertices, fans = [surface.vertices], []
+        label = labels[0] if labels else rest
+        return _with_faces(surface, surface.vertices, np.array([[ends[0], starts[0]]]), [label])
+    vertices, caps, given = [surface.vertices], [], []
     total = len(surface.vertices)
-    for loop in rims(surface.faces):
-        if len(loop) == 3:
-            fans.append(np.array([loop[::-1]]))
-            continue
-        vertices.append(surface.vertices[loop].mean(axis=0, keepdims=True))
-        fans.append(np.column_stack([np.roll(loop, -1), loop, np.full(len(loop), total)]))
-        total += 1
-    return _with_faces(surface, np.concatenate(vertices), np.concatenate(fans), region)
+    loops = rims(surface.faces)
+    if labels:
+        loops.sort(key=lambda loop: -_length(surface.vertices[loop]))
+    for number, loop in enumerate(loops):
+        if len(loop) == 3 or star_shaped(surface.vertices[loop]):
+            cap = np.array([loop[::-1]]) if len(loop) == 3 else _fan(loop, total)
+        else:
+            cap = loop[least_area_triangles(surface.vertices[loop])][:, ::-1]
+        if cap.max() >= total:
+            vertices.append(surface.vertices[loop].mean(axis=0, keepdims=True))
+            total += 1
+        caps.append(cap)
+        given += [labels[number] if number < len(labels) else rest] * len(cap)
+    return _with_faces(surface, np.concatenate(vertices), np.concatenate(caps), given)
+
+
+def _fan(loop: np.ndarray, middle: int) -> np.ndarray:
+    return np.column_stack([np.roll(loop, -1), loop, np.full(len(loop), middle)])
+
+
+def _length(rim: np.ndarray) -> float:
+    return float(np.linalg.norm(rim - np.roll(rim, -1, axis=0), axis=1).sum())
 
 
 def rims(faces: np.ndarray) -> list[np.ndarray]:
@@ -136,9 +159,9 @@ def rims(faces: np.ndarray) -> list[np.ndarray]:
     return sorted(loops, key=len, reverse=True)
 
 
-def _with_faces(surface: Surface, vertices: np.ndarray, faces: np.ndarray, region: int) -> Surface:
-    labels = np.concatenate([surface.region, np.full(len(faces), region, np.uint8)])
-    return Surface(vertices, np.concatenate([surface.faces, faces]), labels)
+def _with_faces(surface: Surface, vertices: np.ndarray, faces: np.ndarray, labels: Sequence[int]) -> Surface:
+    region = np.concatenate([surface.region, np.asarray(labels, np.uint8)])
+    return Surface(vertices, np.concatenate([surface.faces, faces]), region)
 
 
 def _compacted(surface: Surface) -> Surface:

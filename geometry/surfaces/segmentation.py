@@ -1,6 +1,6 @@
 """Surfaces from point clouds, masks and velocity by Delaunay triangulation with an explicit concavity rule.
 
-The thesis (section 3.4) sent the boundary points of a thresholded velocity to qhull, whose simplices together
+Grønli 2017, sec. 3.4 sent the boundary points of a thresholded velocity to qhull, whose simplices together
 fill the convex hull. Which of them are the body is decided here by a rule: for a cloud of points those whose
 circumscribed sphere is no larger than alpha (Edelsbrunner and Muecke 1994, "Three-dimensional alpha shapes"),
 so that concavities wider than 2 alpha appear and an infinite alpha is the convex hull; for a mask those whose
@@ -31,8 +31,10 @@ def surface_from_points(points: np.ndarray, *, alpha: float) -> Surface:
     """The outer surface of a cloud of points `(n, D)`, m, concave down to `alpha` (m).
 
     The points must fill the body, not only its surface, unless alpha exceeds the body's radius. Of several
-    separate bodies the largest is taken; cavities are filled. Raises SurfaceError for too few points, points
-    in a plane, or an alpha below half the spacing of the points.
+    separate bodies the largest is taken; cavities are filled.
+
+    Raises:
+        SurfaceError: too few points, points in a plane, or an alpha below half the spacing of the points.
     """
     points = np.asarray(points, np.float64)
     if points.ndim != 2 or points.shape[1] not in (2, 3) or not np.isfinite(points).all():
@@ -51,7 +53,10 @@ def surface_from_mask(mask: np.ndarray, grid: Grid, *, alpha: float = np.inf, sm
 
     It runs midway between nodes inside and outside and follows every concavity of the mask: a simplex belongs
     to the body where the mask, interpolated at its middle, is at least a half; `alpha` (m) may limit it
-    further. `smoothing` passes of Taubin's filter take the steps out. Raises SurfaceError for an empty mask.
+    further. `smoothing` passes of Taubin's filter take the steps out.
+
+    Raises:
+        SurfaceError: an empty mask.
     """
     mask = np.asarray(mask).astype(bool)
     if mask.shape != grid.shape:
@@ -71,10 +76,10 @@ def surface_from_velocity(
     alpha: float = np.inf,
     smoothing: int = 0,
 ) -> Surface:
-    """The surface around the nodes whose speed exceeds `threshold` (m/s), as in the thesis (section 4.1).
+    """The surface around the nodes whose speed exceeds `threshold` (m/s), as in Grønli 2017, sec. 4.1.
 
     `velocity` (D, *shape) or (T, D, *shape), m/s: with frames, a node counts that exceeds it in any of them.
-    Only for fields that are zero outside the blood: the thesis notes that it does not work in vivo. Further
+    Only for fields that are zero outside the blood: Grønli notes that it does not work in vivo. Further
     as `surface_from_mask`.
     """
     velocity = np.asarray(velocity, np.float64)

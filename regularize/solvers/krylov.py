@@ -45,13 +45,16 @@ class Krylov:
 
     @property
     def factors(self) -> bool:
+        """None."""
         return False
 
     @property
     def starts_from_neighbour(self) -> bool:
+        """Never."""
         return False
 
     def solve(self, system: System, limits: Limits, neighbour: Neighbour | None = None) -> Solved:
+        """By the method, on applied or stored rows."""
         matvec, rmatvec = sparse_operators(system) if limits.stored else (system.matvec, system.rmatvec)
         solution = self.method(
             matvec,
@@ -79,9 +82,11 @@ def lsqr(
     """Minimise |w * (A x - b)|^2 + damping^2 |x|^2.
 
     ``matvec`` and ``rmatvec`` apply the UNWEIGHTED matrix and its adjoint in whatever precision they are
-    handed (b's for the iteration, float64 for the check); ``weight`` (rows,) multiplies rows as in eqs.
-    3.24 and 3.25. Raises NotConverged, unless ``strict`` is False, when the true relative gradient stays
-    above ``tolerance``.
+    handed (b's for the iteration, float64 for the check); ``weight`` (rows,) multiplies rows as in
+    Grønli 2017, eqs. 3.24 and 3.25.
+
+    Raises:
+        NotConverged: when the true relative gradient stays above ``tolerance``, unless ``strict`` is False.
     """
     limits = Limits(tolerance, max_iterations, strict)
     return iterate("lsqr", _run, matvec, rmatvec, b, weight, damping, limits)

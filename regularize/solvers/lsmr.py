@@ -26,7 +26,7 @@ def lsmr(
 
 
 def _run(process: GolubKahan, aim: float, limit: int) -> tuple[torch.Tensor, int]:
-    """One run; names as in the paper's section 5. Damping is rows, as in LSQR."""
+    """One run; names as in Fong & Saunders 2011, sec. 5. Damping is rows, as in LSQR."""
     v, alpha, beta = process.v, process.alpha, process.beta
     zeta_bar, alpha_bar, rho, rho_bar, c_bar, s_bar = alpha * beta, alpha, 1.0, 1.0, 1.0, 0.0
     h, h_bar, x = v.clone(), torch.zeros_like(v), torch.zeros_like(v)

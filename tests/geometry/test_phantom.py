@@ -10,12 +10,11 @@ from geometry import Recording, WallMotion, grid_winding, read_recording
 
 FILES = ["lv_phantom_a.h5", "lv_phantom_a_measured.h5", "lv_phantom_a_noisy.h5"]
 
+pytestmark = pytest.mark.phantom(*FILES)
+
 
 def _read(name: str) -> Recording:
-    path = SHARED_DATA / name
-    if not path.is_file():
-        pytest.skip(f"{path} is not here: the phantom is shared beside the repository, not in it")
-    return read_recording(path)
+    return read_recording(SHARED_DATA / name)
 
 
 @pytest.mark.parametrize("name", FILES)

@@ -170,7 +170,7 @@ def test_files_that_hold_no_surface_are_named(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match="nowhere.stl"):
         read_surface(tmp_path / "nowhere.stl")
     (tmp_path / "mesh.vtk").write_text("x")
-    with pytest.raises(SurfaceError, match="mesh.vtk: surfaces are read from .stl, .obj, .ply, not"):
+    with pytest.raises(SurfaceError, match="mesh.vtk: surfaces are read from .stl, .obj, .ply, .vtp, not"):
         read_surface(tmp_path / "mesh.vtk")
     for name in ("bad.ply", "bad.stl", "bad.obj"):
         (tmp_path / name).write_text("nothing of the kind")

@@ -10,7 +10,7 @@ from paths import ROOT
 PACKAGES = ("geometry", "regularize")
 CITED = re.compile(r"Grønli\s+2017,\s+(?:eqs?\.\s+[\d.]+\d(?:(?:,|\s+to|\s+and)\s+(?:eq\.\s+)?[\d.]+\d)*)")
 LINE = re.compile(r"\s*\n\s*(?:#|//)?\s*")
-LISTED = re.compile(r"^\| (\d+\.\d+) \|", re.MULTILINE)
+LISTED = re.compile(r"^\| eq\. (\d+\.\d+) \|", re.MULTILINE)
 NUMBER = re.compile(r"\d+\.\d+")
 # the bare ways of citing it that a reader cannot look up
 BARE = re.compile(r"\bthesis(?:'s)? (?:eq|sec|table|alg|\d)|\(thesis|ERRATA", re.IGNORECASE)

@@ -17,7 +17,8 @@ ALLOWED = {
 }
 # What pyproject.toml declares; `triton` comes with torch's CUDA builds and is asked for where it is used.
 THIRD_PARTY = {
-    "geometry": {"numpy", "scipy", "trimesh", "h5py", "torch"},
+    # what the extra `formats` brings is imported where it is used
+    "geometry": {"numpy", "scipy", "trimesh", "h5py", "torch", "vtkmodules", "nibabel", "nrrd", "xarray", "SimpleITK"},
     # triton comes with torch's CUDA builds; pyuff_ustb is the extra `uff`; both are imported where they are used
     "regularize": {"numpy", "scipy", "torch", "triton"},
     "torchsph": {"numpy", "scipy", "trimesh", "h5py", "torch", "tqdm", "matplotlib", "triton", "pyuff_ustb"},
@@ -97,6 +98,8 @@ def test_the_top_level_holds_only_what_the_design_names():
         "examples",
         "pyproject.toml",
         "README.md",
+        "CONTRIBUTING.md",
+        "CHANGELOG.md",
         "LICENSE",
     }
     made_by_tools = {"build", "dist", "torchsph.egg-info", "torchsph-out", "venv", "shared"}

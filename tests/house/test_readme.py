@@ -25,16 +25,23 @@ def test_it_opens_with_the_two_commands():
     assert README.index(first) < README.index(second) < README.index("**torchsph**")
 
 
-def test_ci_runs_the_test_command_of_the_readme():
+def test_ci_runs_the_test_command_of_the_readme_and_then_the_gates():
     script = (ROOT / ".ci" / "run").read_text(encoding="utf-8").splitlines()
-    assert blocks("sh")[1].strip() in script
+    commands = [blocks("sh")[1].strip(), "ruff check", "ruff format --check", "mypy"]
+    places = [script.index(command) for command in commands]
+    assert places == sorted(places)
+    assert all(script[place + 1] == "keep" for place in places)  # so that none fails unseen
     assert (ROOT / ".ci" / "run").stat().st_mode & 0o111
 
 
 def test_the_project_file_defines_what_the_commands_need():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     assert project["scripts"]["torchsph"] == "torchsph.cli:main"
-    assert {"pytest", "hypothesis"} <= {re.split(r"\W", need)[0] for need in project["optional-dependencies"]["test"]}
+    extras = {
+        name: {re.split(r"\W", need)[0] for need in needs} for name, needs in project["optional-dependencies"].items()
+    }
+    assert {"pytest", "hypothesis"} <= extras["test"]
+    assert {"ruff", "mypy"} <= extras["dev"]
 
 
 def test_commands_of_the_table_are_those_of_the_program():

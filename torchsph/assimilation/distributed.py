@@ -67,8 +67,8 @@ class Distributed:
     def screen(self, ensemble: Tensor, predicted: Tensor, observations: Observations) -> Screened:
         """See `Filter.screen`; the same in every process."""
         counts = _counts(len(ensemble), ensemble.device, self.group)
-        everyone = (gather_members(part, counts, self.group) for part in (ensemble, predicted))
-        return self.filter.screen(*everyone, observations)
+        states, everyone = (gather_members(part, counts, self.group) for part in (ensemble, predicted))
+        return self.filter.screen(states, everyone, observations)
 
 
 def gather_members(members: Tensor, counts: list[int], group: dist.ProcessGroup | None = None) -> Tensor:

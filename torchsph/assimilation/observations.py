@@ -115,11 +115,11 @@ def concatenate(sources: Sequence[Observations]) -> Observations:
     """
     if not sources:
         raise AssimilationError("there are no observations to concatenate")
-    located = all(part.position is not None for part in sources)
+    places = [places for part in sources if (places := part.places) is not None]
     return Observations(
         value=torch.cat([part.value for part in sources], -1),
         variance=torch.cat([part.variance.expand_as(part.value) for part in sources], -1),
-        position=torch.cat([part.places for part in sources]) if located else None,
+        position=torch.cat(places) if len(places) == len(sources) else None,
         redundancy=torch.cat(
             [torch.as_tensor(part.redundancy, device=part.value.device).expand(len(part)) for part in sources]
         ),

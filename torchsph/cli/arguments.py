@@ -10,7 +10,9 @@ import math
 from collections.abc import Callable
 from typing import NoReturn
 
-from torchsph._version import __version__
+from torchsph import __version__
+
+from . import convert, export
 
 __all__ = ["OUT", "build_parser"]
 
@@ -35,7 +37,10 @@ def build_parser(commands: dict[str, Callable[[argparse.Namespace], None]], pres
         ("forecast", _forecast),
         ("measure", _measure),
         ("smooth", _smooth),
+        ("quantify", _quantify),
         ("info", _info),
+        ("convert", convert.describe),
+        ("export", export.describe),
     ):
         text = (describe.__doc__ or "").strip()
         sub = subparsers.add_parser(name, help=text.splitlines()[0], description=text)
@@ -120,10 +125,18 @@ def _smooth(parser: Parser, _: tuple[str, ...]) -> None:
     parser.add_argument("--out", required=True, metavar="SMOOTH.h5", help="the smoothed recording")
 
 
+def _quantify(parser: Parser, _: tuple[str, ...]) -> None:
+    """Pressure, energy, forces and flow rates of a recording, over time and over the beat."""
+    parser.add_argument("analysis", metavar="ANALYSIS.h5", help="velocities: an analysis, a measurement, a truth")
+    parser.add_argument("--truth", metavar="TRUTH.h5", help="the true flow, to compare with")
+    _out(parser)
+
+
 def _info(parser: Parser, _: tuple[str, ...]) -> None:
     """Check a recording against the format and summarise it."""
     parser.add_argument("file", nargs="?", metavar="FILE")
     parser.add_argument("--backends", action="store_true", help="list the pair kernels of this machine")
+    parser.add_argument("--strict", action="store_true", help="refuse whatever else is odd about the recording")
 
 
 def _model(parser: Parser, presets: tuple[str, ...]) -> None:

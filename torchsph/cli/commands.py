@@ -15,8 +15,7 @@ import numpy as np
 import torch
 
 import geometry
-from torchsph import data
-from torchsph._version import __version__
+from torchsph import __version__, data
 from torchsph.assimilation import filter_figure
 from torchsph.evaluation import figures as report
 from torchsph.evaluation import metrics
@@ -25,7 +24,11 @@ from torchsph.methods.frame_splines import smooth as smooth_recording
 from torchsph.methods.runtime import parallel
 
 from .arguments import LEADS
+from .convert import convert
+from .export import export
+from .findings import tell_findings
 from .outputs import output_folder, staged, write_json
+from .quantify import quantify
 
 __all__ = ["COMMANDS"]
 
@@ -224,7 +227,9 @@ def info(args: argparse.Namespace) -> None:
         ]
         _print_table([["backend", "device", "present", "why"], *rows], text=True)
     if args.file is not None:
-        _print_table(summary_table(geometry.read_recording(args.file)), text=True)
+        recording = geometry.read_recording(args.file)
+        _print_table(summary_table(recording), text=True)
+        tell_findings(recording, args.file, strict=args.strict)
 
 
 def summary_table(recording: geometry.Recording) -> list[list[str]]:
@@ -328,10 +333,13 @@ def _say(message: str) -> None:
     print(message, file=sys.stderr)
 
 
-COMMANDS = {
+COMMANDS: dict[str, Callable[[argparse.Namespace], None]] = {
     "assimilate": assimilate,
     "forecast": forecast,
     "measure": measure,
     "smooth": smooth,
+    "quantify": quantify,
     "info": info,
+    "convert": convert,
+    "export": export,
 }

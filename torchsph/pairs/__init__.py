@@ -2,7 +2,9 @@
 
 from .backends.reference import ReferenceBackend
 from .interface import Backend, Moments, MomentumTerms, PairState, Rates, RateTerms, Support
-from .registry import available_backends, backend
+from .registry import available_backends, choose_backend
+
+backend = choose_backend  # its name in earlier versions
 
 __all__ = [
     "Backend",
@@ -15,4 +17,5 @@ __all__ = [
     "Support",
     "available_backends",
     "backend",
+    "choose_backend",
 ]

@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from .cell_search import _key, _shifted, nearest_image, placed_cells
-from .interface import PairState, Support, check_search, per_particle, square_length
+from .interface import PairState, Support, check_search
+from .vectors import per_particle, square_length
 
 
 def centroid_xsph(state: PairState, support: Support, cell: float, period: Tensor | None = None) -> Tensor:

@@ -11,16 +11,18 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Any
+from typing import Generic, TypeVar
 
 import torch
 from torch import Tensor
 
 from .poisson import PoissonProblem, PoissonSolution, solve
 from .smoothing_kernels import SmoothingKernel
+from .terms import PRESSURE_FORMS
 
 CONTINUITY_FORMS = ("volume", "mass")
-PRESSURE_FORMS = ("symmetric", "sum", "switched", "difference")
+# what a backend's search returns: its own affair
+Pairs = TypeVar("Pairs")
 
 
 @dataclass(frozen=True)
@@ -28,8 +30,11 @@ class Support:
     """Kernel and smoothing length of a pass.
 
     Attributes:
+        kernel: the smoothing kernel W.
         length: a float, a tensor (members,), or with ``per_particle`` a tensor (N,): then a pair has the
             mean of its two lengths (Benz 1990; the reference only).
+        dimension: 2 or 3.
+        per_particle: whether ``length`` is given for each particle.
     """
 
     kernel: SmoothingKernel
@@ -78,12 +83,13 @@ class RateTerms:
 
     Attributes:
         continuity: "volume":  sum_b V_b (v_b - v_a) . grad W  (velocity divergence);
-            "mass":  sum_b m_b (v_b - v_a) . grad W  (minus the density rate of 2.19); None: not wanted.
+            "mass":  sum_b m_b (v_b - v_a) . grad W  (minus the density rate of Grønli 2017,
+            eq. 2.19); None: not wanted.
         diffusion: sum_b 2 V_b (d_b - d_a) (x_b - x_a) . grad W / r^2 with the sign that spreads d
             (Molteni & Colagrossi 2009 eq. 2 without its prefactor).
         concentration: sum_b V_b grad W (particle shifting, Lind et al. 2012 eq. 23).
-        xsph: sum_b 2 m_b / (rho_a + rho_b) (v_b - v_a) W (errata to 2.33).
-        shepard: sums of V_b W and of m_b W over b, with b = a (2.20).
+        xsph: sum_b 2 m_b / (rho_a + rho_b) (v_b - v_a) W (Grønli 2017, errata to eq. 2.33).
+        shepard: sums of V_b W and of m_b W over b, with b = a (Grønli 2017, eq. 2.20).
         renormalisation: sum_b V_b (x_b - x_a) (x) grad W (Bonet & Lok 1999 eq. 45), (N, D, D).
         gradient: sum_b V_b (d_b - d_a) grad W, (N, D); the inverse of the renormalisation makes it exact for
             linear d.
@@ -133,11 +139,12 @@ class MomentumTerms:
     """Which accelerations the second pass adds up; every coefficient is a float or a tensor (members,).
 
     Attributes:
-        pressure: "symmetric": -sum m_b (p_a/rho_a^2 + p_b/rho_b^2) grad W (2.23);
+        pressure: "symmetric": -sum m_b (p_a/rho_a^2 + p_b/rho_b^2) grad W (Grønli 2017,
+            eq. 2.23);
             "sum": -sum m_b (p_a + p_b)/(rho_a rho_b) grad W (Colagrossi & Landrini 2003 eq. 8);
             "switched": as "sum" with p_a replaced by |p_a| (Sun et al. 2017 eq. 11: tensile control);
             "difference": as "sum" with -p_a (exact for constant pressure, not conservative); None: none.
-        artificial: alpha * c in 2.29 (speed); None switches the artificial viscosity off.
+        artificial: alpha * c in Grønli 2017, eq. 2.29 (speed); None switches the artificial viscosity off.
         laminar: kinematic viscosity nu of Morris, Fox & Zhu 1997 eq. 22; None switches it off.
         tensile: coefficient R of Monaghan 2000 (0.2 there, for the symmetric form); None switches it off.
         tensile_distance: distance at which its weight (W(r)/W(r0))^4 is one (the particle spacing).
@@ -177,7 +184,7 @@ class Moments:
     field_first: Tensor
 
 
-class Backend(ABC):
+class Backend(ABC, Generic[Pairs]):
     """A way to evaluate the pair sums.  ``pairs`` is whatever ``search`` returned, opaque to the caller.
 
     Attributes:
@@ -196,46 +203,57 @@ class Backend(ABC):
         *,
         margin: float = 0.0,
         period: Tensor | None = None,
-    ) -> Any:
+    ) -> Pairs:
         """Find the pairs closer than ``radius + margin``.
 
-        The result serves until a particle has moved by ``margin / 2``. ``period`` (D,) gives the period of
-        each axis (inf: not periodic).
+        The result serves until a particle has moved by ``margin / 2``.
+
+        Args:
+            position: (N, D).
+            member: (N,) int64.
+            radius: of the kernel's support.
+            margin: added to the radius.
+            period: (D,) of each axis, inf where it is not periodic; None: no axis is.
 
         Raises:
             ValueError: a position is not finite, or a period is shorter than three radii.
         """
 
-    def order(self, pairs: Any) -> Tensor | None:
+    def order(self, pairs: Pairs) -> Tensor | None:
         """Particle indices (N,) in an order that makes the sums faster; None: it does not matter."""
         return None
 
     @abstractmethod
-    def rates(self, pairs: Any, state: PairState, support: Support, terms: RateTerms) -> Rates:
+    def rates(self, pairs: Pairs, state: PairState, support: Support, terms: RateTerms) -> Rates:
         """First pass: sums over neighbours that need positions, velocities and densities."""
 
     @abstractmethod
-    def momentum(self, pairs: Any, state: PairState, support: Support, terms: MomentumTerms) -> Tensor:
+    def momentum(self, pairs: Pairs, state: PairState, support: Support, terms: MomentumTerms) -> Tensor:
         """Second pass: acceleration (N, D)."""
 
     def right_hand_side(
-        self, pairs: Any, state: PairState, support: Support, rates: RateTerms, momentum: MomentumTerms
+        self, pairs: Pairs, state: PairState, support: Support, rates: RateTerms, momentum: MomentumTerms
     ) -> tuple[Rates, Tensor]:
         """Both passes at one state, where pressure does not wait for rates; a backend may share the loop."""
         return self.rates(pairs, state, support, rates), self.momentum(pairs, state, support, momentum)
 
     @abstractmethod
     def laplacian(
-        self, pairs: Any, state: PairState, support: Support, field: Tensor, active: Tensor | None = None
+        self, pairs: Pairs, state: PairState, support: Support, field: Tensor, active: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
         """sum_b 2 V_b (-F) r^2/(r^2 + 0.01 h^2) (field_a - field_b) and its diagonal, both (N,).
 
-        ``active`` (N,) bool: only pairs of two active particles count (None: all).
+        Args:
+            pairs: of ``search``.
+            state: the particles.
+            support: kernel and smoothing length.
+            field: (N,).
+            active: (N,) bool, only pairs of two active particles count; None: all.
         """
 
     def poisson(
         self,
-        pairs: Any,
+        pairs: Pairs,
         state: PairState,
         support: Support,
         source: Tensor,
@@ -251,9 +269,16 @@ class Backend(ABC):
         """Solve ``laplacian`` u = ``source`` (N,) for each group by itself; a backend may do it in one piece.
 
         Args:
-            start: (N,) or None for 0. free: (N,) bool, the unknowns; elsewhere u is 0. active: as in ``laplacian``.
+            pairs: of ``search``.
+            state: the particles.
+            support: kernel and smoothing length.
+            source: (N,).
+            start: (N,), a guess; None: 0.
+            free: (N,) bool, the unknowns; elsewhere u is 0.
+            active: (N,) bool, as in ``laplacian``.
             singular: (groups,) bool, where u is determined up to a constant and the mean of the source is taken out.
-            tolerance: of the residual relative to the source. iterations: at most.
+            tolerance: of the residual relative to the source.
+            iterations: at most.
             group: (N,) int64, sets of particles that do not interact; None: the members.
         """
         diagonal = self.laplacian(pairs, state, support, torch.zeros_like(source), active)[1]
@@ -284,28 +309,15 @@ class Backend(ABC):
         """Moments of a first-order moving-least-squares fit at query points.
 
         Args:
-            position: (N, D), member: (N,) int64, fields: (N, C) of the particles.
-            query: (M, D), query_member: (M,) int64; a query sees the particles of its own member only.
+            position: (N, D) of the particles.
+            member: (N,) int64.
+            fields: (N, C) of the particles.
+            support: kernel and smoothing length.
+            query: (M, D).
+            query_member: (M,) int64; a query sees the particles of its own member only.
+            period: (D,) of each axis, inf where it is not periodic; None: no axis is.
             weight: (N,) of the particles, not negative, that W is multiplied by; None: all one.
         """
-
-
-def per_particle(value: float | Tensor, member: Tensor) -> float | Tensor:
-    """A coefficient given per member, (members,), spread over the particles (N,); a float stays a float."""
-    return value.index_select(0, member) if isinstance(value, Tensor) and value.ndim else value
-
-
-def inner(first: Tensor, second: Tensor) -> Tensor:
-    """Inner products (N,) of vectors (N, D), column by column: less than a reduction over so short an axis takes."""
-    total = first[:, 0] * second[:, 0]
-    for axis in range(1, first.shape[1]):
-        total = torch.addcmul(total, first[:, axis], second[:, axis])
-    return total
-
-
-def square_length(vectors: Tensor) -> Tensor:
-    """|v|^2 (N,) of vectors (N, D)."""
-    return inner(vectors, vectors)
 
 
 def check_search(position: Tensor | None, radius: float, period: Tensor | None) -> None:

@@ -2,16 +2,34 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
-import torch
-
-from torchsph.native.library import LibraryMissing, library
-
-from .backends import triton_backend as cuda
-from .backends.cpu import CpuBackend
-from .backends.reference import ReferenceBackend
+from .backends import cpu, reference, triton_backend
 from .interface import Backend
+
+
+@dataclass(frozen=True)
+class RegisteredBackend:
+    """A backend that can be asked for by name.
+
+    Attributes:
+        name: that of its instances.
+        make: makes one.
+        status: whether it can be used on a device, and why (not).
+    """
+
+    name: str
+    make: Callable[[], Backend]
+    status: Callable[[str], tuple[bool, str]]
+
+
+# the best first; tests/torchsph/pairs/test_backends.py runs its battery on all of them
+BACKENDS = (
+    RegisteredBackend("cuda", triton_backend.CudaBackend, triton_backend.status),
+    RegisteredBackend("cpu", cpu.CpuBackend, cpu.status),
+    RegisteredBackend("reference", reference.ReferenceBackend, reference.status),
+)
 
 
 @dataclass(frozen=True)
@@ -25,37 +43,26 @@ class BackendStatus:
 
 def available_backends(device: str = "cpu") -> list[BackendStatus]:
     """The known backends, best first, each with the reason why it can or cannot be used on ``device``."""
-    reference = BackendStatus("reference", True, "plain torch, any device, always present")
-    return [BackendStatus("cuda", *cuda.status(device)), _cpu_status(device), reference]
+    return [BackendStatus(known.name, *known.status(device)) for known in BACKENDS]
 
 
-def _cpu_status(device: str) -> BackendStatus:
-    if torch.device(device).type != "cpu":
-        return BackendStatus("cpu", False, f"works on CPU tensors only, the device asked for is '{device}'")
-    try:
-        compiled = library()
-    except LibraryMissing as problem:
-        return BackendStatus("cpu", False, str(problem))
-    return BackendStatus("cpu", True, f"compiled C++ on {compiled.instruction_set} instructions")
+def choose_backend(name: str = "auto", device: str = "cpu") -> Backend:
+    """A pair backend by name.
 
-
-def backend(name: str = "auto", device: str = "cpu") -> Backend:
-    """The backend called ``name``, or the best one that is present for "auto".
+    Args:
+        name: "auto" for the best one that is present, or that of one of ``BACKENDS``.
+        device: where the particles are.
 
     Raises:
         ValueError: the name is unknown, or the backend was asked for by name and is missing (the reason and
             the cure are in the message; nothing slower is taken silently in its place).
     """
-    known = available_backends(device)
-    if name == "auto":
-        return _make(next(status.name for status in known if status.present))
-    for status in known:
-        if status.name == name:
-            if not status.present:
-                raise ValueError(f"backend '{name}' was asked for and cannot be used: {status.reason}")
-            return _make(name)
-    raise ValueError(f"unknown backend '{name}'; known: auto, {', '.join(status.name for status in known)}")
-
-
-def _make(name: str) -> Backend:
-    return {"cuda": cuda.CudaBackend, "cpu": CpuBackend, "reference": ReferenceBackend}[name]()
+    for known in BACKENDS:
+        if name not in ("auto", known.name):
+            continue
+        present, reason = known.status(device)
+        if present:
+            return known.make()
+        if name == known.name:
+            raise ValueError(f"backend '{name}' was asked for and cannot be used: {reason}")
+    raise ValueError(f"unknown backend '{name}'; known: auto, {', '.join(known.name for known in BACKENDS)}")

@@ -3,6 +3,9 @@
 Every kernel is written in the ratio q = r / h as  W = sigma_D / h^D * w(q)  and
 dW/dr = sigma_D / h^(D+1) * w'(q).  Pair loops use the *gradient factor*  F = (dW/dr) / r, so that
 grad_a W_ab = F * (x_a - x_b) needs no division by a vanishing distance.
+
+``native/build.py`` numbers the kernels for C++ from here and reads this file by its path where there is no torch, which
+is imported for the type checker alone.
 """
 
 from __future__ import annotations
@@ -10,11 +13,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, TypeAlias
 
-import torch
-from torch import Tensor
+if TYPE_CHECKING:
+    from torch import Tensor
 
-Profile = Callable[[Tensor], Tensor]
+Profile: TypeAlias = "Callable[[Tensor], Tensor]"
 
 
 @dataclass(frozen=True)
@@ -56,10 +60,10 @@ class SmoothingKernel:
 
 
 def truncated_gaussian(truncation: float = 3.0) -> SmoothingKernel:
-    """Gaussian of standard deviation h cut at ``truncation`` h (thesis 2.10, 2.11 with the errata's divisors).
+    """Gaussian of standard deviation h cut at ``truncation`` h (Grønli 2017, eq. 2.10, 2.11).
 
-    The divisor restores the unit integral over the ball of radius truncation * h: 1 - exp(-t^2/2) in the plane,
-    erf(t/sqrt 2) - sqrt(2/pi) t exp(-t^2/2) in space.
+    The divisors are those of the errata: they restore the unit integral over the ball of radius truncation * h,
+    1 - exp(-t^2/2) in the plane and erf(t/sqrt 2) - sqrt(2/pi) t exp(-t^2/2) in space.
     """
     if truncation <= 0:
         raise ValueError(f"truncation must be positive, got {truncation}")
@@ -70,10 +74,10 @@ def truncated_gaussian(truncation: float = 3.0) -> SmoothingKernel:
     return SmoothingKernel(
         f"gaussian-{truncation:g}",
         t,
-        lambda q: torch.exp(-0.5 * q * q),
-        lambda q: -torch.exp(-0.5 * q * q),
+        lambda q: (-0.5 * q * q).exp(),
+        lambda q: -(-0.5 * q * q).exp(),
         sigma,
-        "Gronli 2017 eq. 2.10-2.11",
+        "Grønli 2017, eq. 2.10-2.11",
     )
 
 
@@ -107,7 +111,7 @@ def _wendland_t(q: Tensor) -> Tensor:
 
 
 def _spiky_slope(q: Tensor) -> Tensor:
-    # dW/dr does not vanish at r = 0 (eq. 2.14); the floor only matters where the direction is undefined anyway
+    # dW/dr does not vanish at r = 0 (Grønli 2017, eq. 2.14); the floor only matters where there is no direction
     return -3.0 * (1.0 - q).clamp_min(0.0) ** 2 / q.clamp_min(1e-6)
 
 
@@ -157,15 +161,18 @@ KERNELS: dict[str, SmoothingKernel] = {
         lambda q: (1 - q).clamp_min(0.0) ** 3,
         _spiky_slope,
         {2: 10 / _PI, 3: 15 / _PI},
-        "Desbrun & Gascuel 1996; Gronli 2017 eq. 2.13-2.14",
+        "Desbrun & Gascuel 1996; Grønli 2017, eq. 2.13-2.14",
     ),
 }
+# what compiled code calls them: Gaussians of every truncation are one family
+NUMBERS = {name: number for number, name in enumerate(KERNELS)}
 
 
 def viscosity_laplacian(distance: Tensor, smoothing_length: Tensor | float) -> Tensor:
-    """Laplacian 45 / (pi h^6) (h - r) of the 3-D viscosity kernel (thesis 2.15, 2.16); support h, never negative.
+    """Laplacian 45 / (pi h^6) (h - r) of the 3-D viscosity kernel; support h, never negative.
 
-    Only the Laplacian is offered: the kernel itself is singular at r = 0 (errata to 2.13-2.16).
+    Grønli 2017, eq. 2.15, 2.16. Only the Laplacian is offered: the kernel itself is singular at r = 0 (errata to
+    eq. 2.13-2.16).
     """
     gap = (smoothing_length - distance).clamp_min(0.0)
     return 45.0 / (math.pi * smoothing_length**6) * gap

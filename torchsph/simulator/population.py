@@ -7,24 +7,24 @@ from the particles around it.  What flows through valves is left to the reservoi
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
-from torchsph.pairs.interface import Backend, Moments, Support, square_length
+from torchsph.pairs.cell_search import nearest_image
+from torchsph.pairs.interface import Backend, Moments, Support
+from torchsph.pairs.moving_least_squares import first_order_value
 from torchsph.pairs.smoothing_kernels import kernel
+from torchsph.pairs.vectors import square_length
 
-from .imposing import first_order_value
+from .schemes.population_control import PopulationControl
 from .state.particles import FLUID, Particles
 from .state.record import Record
+from .surroundings import PresentSurroundings
+from .walls.interface import CompleteWallSample
 
-if TYPE_CHECKING:
-    from .domain import Domain
-
-# particles that fill less of what encloses them have a free surface, beyond which there is nothing to seed
-_LEAST_FILLING = 0.9
+# beyond a free surface there is nothing to seed
+_UNFILLED = "population control needs fluid that fills its walls or its box; it fills {filling}"
 # new particles keep this far (spacings) from walls
 _CLEARANCE = 0.3
 # largest share of its mass that a particle gives away at once
@@ -33,68 +33,47 @@ _LARGEST_GIFT = 0.4
 _LARGEST_OFFSET = 0.5
 
 
-@dataclass(frozen=True)
-class PopulationControl:
-    """When particles are merged and seeded.
-
-    Attributes:
-        every: steps between one look and the next.
-        closest: particles nearer to each other than this (spacings) are merged, None: none are.
-        heaviest: but not to more than this mass, in those of a cubic spacing of fluid.
-        missing: an empty cell is seeded where at least so much of a particle is missing from the sum of all kernels at
-            its centre, None: none are. Disorder alone takes up to a half.
-    """
-
-    every: int = 20
-    closest: float | None = 0.4
-    heaviest: float = 2.5
-    missing: float | None = 0.75
-
-    def __post_init__(self) -> None:
-        if self.every < 1:
-            raise ValueError(f"PopulationControl.every must be at least 1 step, got {self.every}")
-        if self.closest is not None and not 0 < self.closest < 1:
-            raise ValueError(f"PopulationControl.closest must lie in (0, 1) spacings or be None, got {self.closest}")
-        if not self.heaviest > 0:
-            raise ValueError(f"PopulationControl.heaviest must be positive, got {self.heaviest}")
-        if self.missing is not None and not self.missing > 0:
-            raise ValueError(f"PopulationControl.missing must be positive or None, got {self.missing}")
-
-
 class Population:
     """Controls the population of a run; internal units, all members at once."""
 
     def __init__(
-        self, options: PopulationControl, domain: Domain, support: Support, backend: Backend, record: Record
+        self,
+        options: PopulationControl,
+        surroundings: PresentSurroundings,
+        support: Support,
+        backend: Backend,
+        record: Record,
     ) -> None:
-        self.options, self.domain, self._support, self._backend = options, domain, support, backend
+        self.options, self._surroundings, self._support, self._backend = options, surroundings, support, backend
+        self.domain = domain = surroundings.domain
         self._record = record
         zero = torch.zeros(1, dtype=torch.float64)
         self._peak = float(support.kernel.value(zero, support.length, support.dimension))
         self._lower = self._upper = torch.zeros(support.dimension, dtype=domain.dtype, device=domain.device)
         if domain.walls is not None:  # a particle that has got away must not make the grid of cells endless
-            ends = torch.as_tensor(domain.scene.walls.vertices_at_keys, dtype=domain.dtype, device=domain.device)
+            ends = torch.as_tensor(domain.walls.motion.vertices_at_keys, dtype=domain.dtype, device=domain.device)
             ends = ends.reshape(-1, support.dimension) / domain.units.length
             self._lower, self._upper = torch.floor(ends.amin(0)) - 1.0, ends.amax(0) + 1.0
 
     @classmethod
     def of(
-        cls, domain: Domain, backend: Backend, record: Record, particles: Particles, time: float
+        cls, surroundings: PresentSurroundings, backend: Backend, record: Record, particles: Particles, time: float
     ) -> Population | None:
         """The control that the domain's scheme asks for, or None.
 
         Raises ValueError where the particles do not fill what encloses them.
         """
-        scheme = domain.scheme
+        domain, scheme = surroundings.domain, surroundings.domain.scheme
         if scheme.population is None:
             return None
-        filling = float(domain.filling(particles, time).min()) if particles.count else 0.0
-        if filling < _LEAST_FILLING:
-            raise ValueError(
-                f"population control needs fluid that fills its walls or its box; it fills {100 * filling:.0f} %"
-            )
+        domain.check_filled(particles, time, _UNFILLED)
         support = Support(kernel(scheme.kernel), scheme.smoothing_ratio, domain.scene.dimension)
-        return cls(scheme.population, domain, support, backend, record)
+        return cls(scheme.population, surroundings, support, backend, record)
+
+    def controlled_when_due(self, particles: Particles, active: Tensor) -> tuple[Particles, bool]:
+        """``controlled`` in the members ``active`` (members,) bool whose turn it is."""
+        due = active & (self._record.steps % self.options.every == 0)
+        return self.controlled(particles, due) if bool(due.any()) else (particles, False)
 
     def controlled(self, particles: Particles, due: Tensor) -> tuple[Particles, bool]:
         """Merge and seed in the members where ``due`` (members,) bool; True where that has changed the set."""
@@ -135,7 +114,7 @@ class Population:
                 continue
             way = value[second] - value[first]
             if name == "position":
-                way = self.domain.shortest(way)
+                way = nearest_image(way, self.domain.period)
             weight = part.reshape(-1, *[1] * (value.ndim - 1))
             changes[name] = value.index_copy(0, first, value[first] + weight * way)
         keep = torch.ones_like(particles.fluid).index_fill(0, second, False)
@@ -196,20 +175,21 @@ class Population:
             index.insert(0, left % counts[axis])
             left = left // counts[axis]
         centre = origin + (torch.stack(index, 1).to(origin.dtype) + 0.5) * size
-        share = torch.ones_like(centre[:, 0])
+        completeness = torch.ones_like(centre[:, 0])
         fit = torch.ones_like(number, dtype=torch.bool)
         if self.domain.walls is not None and number.numel():
-            wall = self.domain.sample_at(centre)
-            # without the kernel's share the sum means nothing where walls cut the kernel
-            clear = _CLEARANCE if wall.share is not None else self._support.radius
-            fit = (wall.distance > clear) & ~self.domain.beyond_valves(centre)
-            share = share if wall.share is None else wall.share
+            wall = self._surroundings.sample_at(centre)
+            # without the kernel's completeness the sum means nothing where walls cut the kernel
+            complete = isinstance(wall, CompleteWallSample)
+            clear = _CLEARANCE if complete else self._support.radius
+            fit = (wall.distance > clear) & ~self._surroundings.beyond_valves(centre)
+            completeness = wall.completeness if complete else completeness
         member, which = torch.nonzero(empty[:, number[fit]], as_tuple=True)
-        centre, share = centre[fit][which], share[fit][which]
+        centre, completeness = centre[fit][which], completeness[fit][which]
         if not member.numel():
             return centre, member
         covered = self._sums(particles, particles.mass[:, None], centre, member).value
-        hole = covered < share * (1.0 - self.options.missing * self._peak)
+        hole = covered < completeness * (1.0 - self.options.missing * self._peak)
         return centre[hole], member[hole]
 
     def _sums(self, particles: Particles, fields: Tensor, place: Tensor, member: Tensor) -> Moments:

@@ -7,24 +7,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from .schemes.weakly_compressible import Rollback
+from .schemes.parts import Rollback
 from .state.particles import Particles
 from .state.record import Record
-
-# accounts of what happened to the fluid: what happens in a stretch that is taken back has not happened
-_TAKEN_BACK = (
-    "inserted",
-    "removed",
-    "crossed_wall",
-    "inflow",
-    "outflow",
-    "energy_in",
-    "energy_out",
-    "wall_work",
-    "source_work",
-    "merged",
-    "reseeded",
-)
 
 
 @dataclass(frozen=True)
@@ -37,7 +22,7 @@ class _State:
     accounts: dict[str, Tensor]
 
 
-class Checkpoints:
+class RollbackStates:
     """States of one interval between the times at which members meet.
 
     Attributes:
@@ -56,10 +41,9 @@ class Checkpoints:
         self._calls += 1
         if (self._calls - 1) % self.options.every:
             return
-        accounts = {name: getattr(self._record, name).clone() for name in _TAKEN_BACK}
-        now = _State(particles, acceleration, done, accounts)
+        state = _State(particles, acceleration, done, self._record.kept())
         for member in torch.nonzero(done > self._failed_at).flatten().tolist():
-            self._state[member], self._tries[member], self.factor[member] = now, 0, 1.0
+            self._state[member], self._tries[member], self.factor[member] = state, 0, 1.0
 
     def restored(
         self, broken: Tensor, particles: Particles, acceleration: Tensor, done: Tensor
@@ -82,6 +66,5 @@ class Checkpoints:
             particles, rows = particles.with_member(member, state.particles)
             acceleration = torch.cat([acceleration, state.acceleration])[rows]
             done[member] = state.done[member]
-            for name, account in state.accounts.items():
-                getattr(self._record, name)[member] = account[member]
+            self._record.take_back(member, state.accounts)
         return particles, acceleration, done, given_up

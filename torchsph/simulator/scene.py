@@ -6,6 +6,8 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
+import numpy as np
+
 import geometry
 
 
@@ -40,6 +42,10 @@ class Valve:
             periods, as those of a wall's motion are. None: one period from the first opening on.
         pressure: Pa, a number or a function of time (s); flow through the open valve then follows from it, instead of
             the change of the cavity's volume (None). Only differences between valves that are open together matter.
+        flux: m^3/s (m^2/s in a plane), inwards, a number, a function of time (s), or a table (times (s), fluxes) that
+            is linear between its times and repeats with ``period``. The other open valves take what it leaves of the
+            change of the cavity's volume. None: this one does, beside others by what each carries when a field is
+            imposed.
         stagnation: whether ``pressure`` is that of still fluid behind the valve, of which fluid that enters has spent
             rho v^2 / 2 (Bernoulli), or the static pressure in the opening itself. Fluid leaves against either alike.
     """
@@ -50,6 +56,7 @@ class Valve:
     span: tuple[float, float] | None = None
     pressure: float | Callable[[float], float] | None = None
     stagnation: bool = True
+    flux: float | Callable[[float], float] | tuple[Sequence[float], Sequence[float]] | None = None
 
     def __post_init__(self) -> None:
         if self.region < 1:
@@ -63,6 +70,42 @@ class Valve:
             raise ValueError(f"valve of region {self.region}: intervals that repeat must be finite: {self.intervals}")
         if self.span is not None and not self.span[1] - self.span[0] >= self.period * (1 - 1e-9):
             raise ValueError(f"Valve.span must cover the period of {self.period} s, got {self.span}")
+
+        if self.flux is not None and self.pressure is not None:
+            raise ValueError(f"valve of region {self.region}: give its flux or its pressure, not both")
+        if isinstance(self.flux, tuple):
+            self._check_table(self.flux)
+
+    def _check_table(self, table: tuple[Sequence[float], Sequence[float]]) -> None:
+        """Raise ValueError where a table of fluxes has no times that increase, or a flux that is not finite."""
+        if len(table) != 2 or len(table[0]) != len(table[1]) or not len(table[0]):
+            raise ValueError(f"Valve.flux of region {self.region}: a table is (times, fluxes) of one length")
+        rising = all(b > a for a, b in zip(table[0], table[0][1:], strict=False))
+        if not rising or not all(math.isfinite(x) for row in table for x in row):
+            raise ValueError(f"Valve.flux of region {self.region}: times must increase and fluxes be finite (s, m^3/s)")
+
+    def flux_at(self, time: float) -> float:
+        """The given flux inwards (m^3/s; m^2/s in a plane) at ``time`` (s).
+
+        Raises:
+            ValueError: it is not given, not finite, or a table without a period does not reach to this time.
+        """
+        if self.flux is None:
+            raise ValueError(f"the valve of region {self.region} has no given flux")
+        if isinstance(self.flux, tuple):
+            times, values = self.flux
+            if self.period:
+                value = float(np.interp(time, times, values, period=self.period))
+            elif times[0] - 1e-9 <= time <= times[-1] + 1e-9:
+                value = float(np.interp(time, times, values))
+            else:
+                known = f"from {times[0]:g} to {times[-1]:g} s"
+                raise ValueError(f"Valve.flux of region {self.region} is known {known}, not at {time:g} s")
+        else:
+            value = float(self.flux(time) if callable(self.flux) else self.flux)
+        if not math.isfinite(value):
+            raise ValueError(f"Valve.flux of region {self.region} must be finite (m^3/s), got {value} at {time:g} s")
+        return value
 
     def pressure_at(self, time: float) -> float:
         """The given pressure (Pa) at ``time`` (s).
@@ -139,6 +182,10 @@ class Scene:
             raise ValueError(f"Scene.dimension must be 2 or 3, got {self.dimension}")
         if not self.reference_speed > 0:
             raise ValueError(f"Scene.reference_speed must be positive (m/s), got {self.reference_speed}")
+        if self.valves and all(valve.flux is not None for valve in self.valves):
+            raise ValueError(
+                "every valve has a given flux: leave the flux of at least one to what is left of dV/dt (flux=None)"
+            )
         if self.valves and self.walls is None:
             raise ValueError("a scene with valves needs walls: the valves are orifices of the wall")
         for name in ("gravity", "period"):
@@ -165,8 +212,11 @@ class Scene:
         """The fluid, the moving walls and the valves of a recording: only what it has.
 
         ``spacing`` defaults to the smallest grid spacing. The reference speed is 1 m/s, typical of the heart, so that
-        the same scene results from a noisy and from a clean recording.
+        the same scene results from a noisy and from a clean recording. Walls that flicker are estimated, and valve
+        times that the recording lacks or cannot mean (``geometry.estimated``).
         """
+        recording.wall_for("the simulator")
+        recording = geometry.estimated(recording).recording
         intervals = recording.valve_intervals_or_derived()
         regions: dict[int, list[tuple[float, float]]] = {}
         span = (float(recording.time[0]), max(float(recording.time[-1]), float(recording.time[0]) + recording.period))
@@ -176,7 +226,7 @@ class Scene:
                 opening = float(opening) if math.isfinite(opening) else span[0]
                 closing = float(closing) if math.isfinite(closing) else span[1]
             rows.append((float(opening), float(closing)))
-        present = {int(region) for region in recording.wall.region}
+        present = {int(region) for region in recording.wall_for("the simulator").region}
         valves = tuple(
             Valve(r, tuple(sorted(rows)), recording.period, span) for r, rows in sorted(regions.items()) if r in present
         )

@@ -3,25 +3,23 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from geometry import WallMotion
-from torchsph.pairs import backend as choose_backend
-from torchsph.pairs.interface import PairState, RateTerms, Support
+from torchsph.pairs.interface import Backend, RateTerms, Support
 from torchsph.pairs.smoothing_kernels import kernel
 
-from .schemes.weakly_compressible import CompleteKernelWall, PotentialWall
+from .domain import Domain
+from .schemes.wall_models import PotentialWall
+from .schemes.weakly_compressible import WeaklyCompressible
 from .state.neighbour_list import PairSearch
 from .state.particles import FLUID, Particles
 from .stepping.pressure import Neighbourhood, packing
-from .walls.forces import potential
-
-if TYPE_CHECKING:
-    from .simulator import Simulator
+from .surroundings import PresentSurroundings
+from .walls.interface import complete_sample
+from .walls.potential import potential
 
 _TRIES = 200
 _LARGEST_MOVE = 0.1
@@ -36,9 +34,9 @@ class Seeding:
 
     Attributes:
         kind: "boltzmann": random positions accepted with exp(-(U - U0) / T) (section 3.1.4 and its erratum);
-            "quiet": a lattice cut by the walls, then relaxed until the crowding gradient is small.
+            "quiet": a lattice cut by the walls, then relaxed until the concentration gradient is small.
         temperature: T in units of the wall potential at d = 0 (boltzmann).
-        relaxations: sweeps of the quiet start that move particles down the gradient of their crowding.
+        relaxations: sweeps of the quiet start that move particles down the gradient of their concentration.
         packings: solves after them that even out the number density (``projection.packing``), open valves included.
         jitter: random displacement of lattice points, in spacings (quiet).
     """
@@ -59,73 +57,62 @@ class Seeding:
             )
 
 
-def seed_particles(simulator: Simulator, time: float, generator: torch.Generator) -> Particles:
-    """One member of resting fluid at rest density that fills the scene's walls, or its periodic box, at ``time`` (s).
+def seed_particles(
+    domain: Domain, backend: Backend, time: float, generator: torch.Generator, seeding: Seeding | None = None
+) -> Particles:
+    """One member of resting fluid at rest density that fills the scene's walls, or its periodic box.
 
-    Raises ValueError where the scene has neither, or where the spacing leaves no room for a particle.
+    Args:
+        domain: of the scene.
+        backend: for the sums over neighbours.
+        time: s.
+        generator: of the random numbers.
+        seeding: how particles are placed; None takes what the scheme's walls call for.
+
+    Raises:
+        ValueError: the scene has neither walls nor a box, or the spacing leaves no room for a particle.
     """
-    domain = simulator.domain
-    soft = isinstance(simulator.scheme.wall, PotentialWall)
-    seeding = simulator.seeding or Seeding("boltzmann" if soft and domain.walls is not None else "quiet")
+    scene, soft = domain.scene, not domain.scheme.wall.complete
+    seeding = seeding or Seeding("boltzmann" if soft and domain.walls is not None else "quiet")
     if domain.walls is None:
-        position = _box_lattice(simulator, seeding, generator)
+        position = _box_lattice(domain, seeding, generator)
         return _resting(position, torch.ones_like(position[:, 0]))
-    domain.enter(time, time, shut=True)
-    lower, upper = _wall_box(simulator, time)
-    place = _boltzmann if seeding.kind == "boltzmann" else _quiet
-    position = place(simulator, seeding, lower, upper, generator)
+    surroundings = PresentSurroundings(domain)
+    surroundings.enter(time, time, shut=True)
+    if seeding.kind == "boltzmann":
+        position = _boltzmann(surroundings, seeding, generator)
+    else:
+        position = _quiet(surroundings, backend, seeding, generator)
     if position.shape[0] == 0:
         raise ValueError(
-            f"no particle of spacing {simulator.scene.spacing:g} m fits inside the walls at {time:g} s; use a finer "
-            "spacing"
+            f"no particle of spacing {scene.spacing:g} m fits inside the walls at {time:g} s; use a finer spacing"
         )
-    volume = domain.fluid_volume(time) / simulator.scene.spacing**simulator.scene.dimension
-    mass = torch.full_like(position[:, 0], volume / position.shape[0])
-    resting = _resting(position, mass)
+    volume = domain.fluid_volume(time) / scene.spacing**scene.dimension
+    resting = _resting(position, torch.full_like(position[:, 0], volume / position.shape[0]))
     if seeding.kind != "quiet" or soft or not seeding.packings:
         return resting
-    return packed(simulator, resting, time, seeding.packings)
+    return packed(surroundings, backend, resting, time, seeding.packings)
 
 
-@dataclass(frozen=True)
-class ResidualMotion:
-    """How a fluid moves that should rest: RMS and largest speed of its particles, m/s."""
-
-    rms: float
-    largest: float
-
-
-def residual_motion(simulator: Simulator, time: float, *, duration: float = 0.02, seed: int = 0) -> ResidualMotion:
-    """What a start at ``time`` (s) leaves moving after ``duration`` (s), with walls held still and no forces or valves.
-
-    None of it is flow: it is the noise floor of what is imposed on such a start.
-    """
-    walls = simulator.scene.walls
-    still = None if walls is None else WallMotion.at_rest(walls.surface(time))
-    scene = replace(simulator.scene, walls=still, valves=(), gravity=None)
-    run = replace(simulator, scene=scene).start(0.0, seed=seed)
-    run.advance(duration)
-    speed = run.particles.velocity.double().norm(dim=1) * run.units.speed
-    return ResidualMotion(float(speed.square().mean().sqrt()), float(speed.max()))
-
-
-def _neighbours(simulator: Simulator) -> tuple[Support, PairSearch]:
+def _neighbours(domain: Domain, backend: Backend) -> tuple[Support, PairSearch]:
     """The scheme's kernel and a search for its neighbours."""
-    scheme = simulator.scheme
-    support = Support(kernel(scheme.kernel), scheme.smoothing_ratio, simulator.scene.dimension)
-    backend = choose_backend(simulator.backend, simulator.device)
-    return support, PairSearch(backend, support.radius, 0.5, simulator.domain.period)
+    scheme = domain.scheme
+    support = Support(kernel(scheme.kernel), scheme.smoothing_ratio, domain.scene.dimension)
+    return support, PairSearch(backend, support.radius, 0.5, domain.period)
 
 
-def packed(simulator: Simulator, particles: Particles, time: float, times: int) -> Particles:
+def packed(
+    surroundings: PresentSurroundings, backend: Backend, particles: Particles, time: float, times: int
+) -> Particles:
     """Particles whose number density is evened out, the channels of valves that are open at ``time`` (s) included."""
-    domain, (support, search) = simulator.domain, _neighbours(simulator)
-    domain.enter(time, time)
-    particles = domain.prepare(particles)
+    support, search = _neighbours(surroundings.domain, backend)
+    surroundings.enter(time, time)
+    particles = surroundings.prepare(particles)
     for _ in range(times):
-        here = Neighbourhood(particles, search, search.at(particles), support, domain.sample(particles))
-        particles = particles.changed(position=particles.position + packing(here)[0])
-        wall = domain.sample(particles)
+        wall = surroundings.sample(particles)
+        neighbourhood = Neighbourhood(particles, search, search.at(particles), support, wall)
+        particles = particles.changed(position=particles.position + packing(neighbourhood)[0])
+        wall = surroundings.sample_at(particles.position)
         off = torch.where(particles.fluid, (_CLEARANCE - wall.distance).clamp_min(0.0), torch.zeros_like(wall.distance))
         particles = particles.changed(position=particles.position + off[:, None] * wall.normal)
     return particles
@@ -137,27 +124,31 @@ def _resting(position: Tensor, mass: Tensor) -> Particles:
     return Particles(position, torch.zeros_like(position), torch.zeros_like(mass), mass, label, label + FLUID, 1)
 
 
-def _wall_box(simulator: Simulator, time: float) -> tuple[Tensor, Tensor]:
-    vertices = torch.as_tensor(simulator.scene.walls.vertices(time), dtype=simulator.dtype, device=simulator.device)
-    vertices = vertices / simulator.scene.spacing
-    return vertices.amin(0), vertices.amax(0)
+def _wall_box(surroundings: PresentSurroundings) -> tuple[Tensor, Tensor]:
+    """Lower and upper corner (D,), internal, of the walls in the middle of the present interval."""
+    domain = surroundings.domain
+    if domain.walls is None:
+        raise ValueError("a scene without walls has no box around them")
+    vertices = domain.walls.motion.vertices(surroundings.clock.middle)
+    place = torch.as_tensor(vertices, dtype=domain.dtype, device=domain.device) / domain.scene.spacing
+    return place.amin(0), place.amax(0)
 
 
-def _whole_periods(simulator: Simulator) -> list[int]:
+def _whole_periods(domain: Domain) -> list[int]:
     """Lattice points along each periodic axis, 0 along the others; ValueError where they do not fit."""
     counts = []
-    for length in [] if simulator.domain.period is None else simulator.domain.period.tolist():
+    for length in [] if domain.period is None else domain.period.tolist():
         counts.append(round(length) if math.isfinite(length) else 0)
         if counts[-1] and abs(length - counts[-1]) > 1e-3 * length:
             raise ValueError(f"a period of {length:g} spacings is not a whole number; change Scene.spacing")
     return counts
 
 
-def _box_lattice(simulator: Simulator, seeding: Seeding, generator: torch.Generator) -> Tensor:
-    period = simulator.domain.period
+def _box_lattice(domain: Domain, seeding: Seeding, generator: torch.Generator) -> Tensor:
+    period = domain.period
     if period is None or not bool(torch.isfinite(period).all()):
         raise ValueError("a scene without walls must be periodic in every direction to be seeded; else use resume()")
-    position = _lattice(torch.zeros_like(period), _whole_periods(simulator))
+    position = _lattice(torch.zeros_like(period), _whole_periods(domain))
     return position + seeding.jitter * (2 * _uniform(position, generator) - 1)
 
 
@@ -170,33 +161,33 @@ def _uniform(like: Tensor, generator: torch.Generator) -> Tensor:
     return torch.rand(like.shape, generator=generator, dtype=like.dtype, device=like.device)
 
 
-def _boltzmann(
-    simulator: Simulator, seeding: Seeding, lower: Tensor, upper: Tensor, generator: torch.Generator
-) -> Tensor:
+def _boltzmann(surroundings: PresentSurroundings, seeding: Seeding, generator: torch.Generator) -> Tensor:
     """As many particles as rest volumes fit, one random try per unit cell and sweep (thesis 3.1.4).
 
     U0 is the potential of the free interior, 0. Points beyond the wall are refused whatever their potential.
     """
-    model = simulator.scheme.wall
-    if not isinstance(model, PotentialWall):
+    domain = surroundings.domain
+    scheme, model = domain.scheme, domain.scheme.wall
+    if not isinstance(scheme, WeaklyCompressible) or not isinstance(model, PotentialWall):
         raise ValueError("Boltzmann seeding needs a potential wall; use Seeding(kind='quiet')")
-    sound = simulator.scheme.sound_speed / simulator.domain.units.speed
+    sound = scheme.sound_speed / domain.units.speed
     scale = seeding.temperature * 0.5 * model.stiffness * sound**2
+    lower, upper = _wall_box(surroundings)
     origin = torch.floor(lower)
     counts = (torch.ceil(upper) - origin).to(torch.int64).tolist()
-    for axis, count in enumerate(_whole_periods(simulator)):
+    for axis, count in enumerate(_whole_periods(domain)):
         if count:
             origin[axis], counts[axis] = 0.0, count
     corner = _lattice(origin, counts) - 0.5
     # a vectorised sweep over cells, repeated where the try was refused, keeps about one particle per cell
-    wall = simulator.domain.sample_at(corner + 0.5)
+    wall = surroundings.sample_at(corner + 0.5)
     open_cells = torch.nonzero(wall.distance > 0).squeeze(1)
     chosen = []
     for _ in range(_TRIES):
         if open_cells.numel() == 0:
             break
         trial = corner[open_cells] + _uniform(corner[open_cells], generator)
-        wall = simulator.domain.sample_at(trial)
+        wall = surroundings.sample_at(trial)
         chance = torch.exp(-potential(model, sound, wall) / scale) * (wall.distance > 0)
         taken = torch.rand(chance.shape, generator=generator, dtype=chance.dtype, device=chance.device) < chance
         chosen.append(trial[taken])
@@ -204,35 +195,36 @@ def _boltzmann(
     return torch.cat(chosen) if chosen else corner[:0]
 
 
-def _quiet(simulator: Simulator, seeding: Seeding, lower: Tensor, upper: Tensor, generator: torch.Generator) -> Tensor:
-    """A lattice inside the walls, relaxed by shifting down the crowding gradient (Colagrossi et al. 2012)."""
+def _quiet(surroundings: PresentSurroundings, backend: Backend, seeding: Seeding, generator: torch.Generator) -> Tensor:
+    """A lattice inside the walls, relaxed by shifting down the concentration gradient (Colagrossi et al. 2012)."""
+    domain, (lower, upper) = surroundings.domain, _wall_box(surroundings)
     # centred: rows at uneven distances from opposite walls are a density gradient that no wall model can undo
     size = torch.ceil(upper - lower - 1e-3)
     counts, origin = size.to(torch.int64).tolist(), 0.5 * (lower + upper - size)
-    for axis, count in enumerate(_whole_periods(simulator)):
+    for axis, count in enumerate(_whole_periods(domain)):
         if count:
             origin[axis], counts[axis] = 0.0, count
     position = _lattice(origin, counts)
     position = position + seeding.jitter * (2 * _uniform(position, generator) - 1)
-    position = position[simulator.domain.sample_at(position).distance > _CUT]
-    if position.shape[0] == 0 or not isinstance(simulator.scheme.wall, CompleteKernelWall):
+    position = position[surroundings.sample_at(position).distance > _CUT]
+    if position.shape[0] == 0 or not domain.scheme.wall.complete:
         return position
-    volume = simulator.domain.fluid_volume(simulator.domain.middle) / simulator.scene.spacing ** position.shape[1]
-    return relaxed(simulator, position, volume / position.shape[0], seeding.relaxations)
+    volume = domain.fluid_volume(surroundings.clock.middle) / domain.scene.spacing ** position.shape[1]
+    return relaxed(surroundings, backend, position, volume / position.shape[0], seeding.relaxations)
 
 
-def relaxed(simulator: Simulator, position: Tensor, mass: float, sweeps: int) -> Tensor:
-    """Move particles of volume ``mass`` (internal) down the gradient of their crowding, kept off the walls."""
-    support, search = _neighbours(simulator)
+def relaxed(surroundings: PresentSurroundings, backend: Backend, position: Tensor, mass: float, sweeps: int) -> Tensor:
+    """Move particles of volume ``mass`` (internal) down the gradient of their concentration, kept off the walls."""
+    support, search = _neighbours(surroundings.domain, backend)
     for _ in range(sweeps):
         particles = _resting(position, torch.full_like(position[:, 0], mass))
-        state: PairState = particles.state(particles.deviation)
+        state = particles.state(particles.deviation)
         terms = RateTerms(continuity=None, concentration=True)
-        crowding = search.backend.rates(search.at(particles), state, support, terms).concentration
-        wall = simulator.domain.sample_at(position)
-        move = -0.15 * support.length**2 * (crowding - wall.share_gradient)
+        gradient = search.backend.rates(search.at(particles), state, support, terms).concentration
+        wall = surroundings.sample_at(position)
+        move = -0.15 * support.length**2 * (gradient - complete_sample(wall).completeness_gradient)
         length = move.norm(dim=1, keepdim=True)
         position = position + move * (_LARGEST_MOVE / length.clamp_min(_LARGEST_MOVE))
-        wall = simulator.domain.sample_at(position)
+        wall = surroundings.sample_at(position)
         position = position + (_CLEARANCE - wall.distance).clamp_min(0.0)[:, None] * wall.normal
     return position

@@ -6,11 +6,12 @@ from dataclasses import dataclass
 
 import torch
 
-from torchsph.pairs import backend as choose_backend
+from torchsph.pairs import choose_backend
 
 from .domain import Domain
 from .scene import Scene
-from .schemes.presets import Scheme, preset
+from .schemes.presets import preset
+from .schemes.scheme import Scheme
 from .seeding import Seeding, seed_particles
 from .simulation import Simulation
 from .state.particles import Particles
@@ -48,7 +49,7 @@ class Simulator:
 
     @property
     def domain(self) -> Domain:
-        """Walls, valves and forces as particles see them; shared by all runs."""
+        """Walls, valves and forces as particles see them; shared by all runs, and changed by none."""
         return self._domain
 
     def start(self, time: float, *, members: int = 1, seed: int = 0) -> Simulation:
@@ -56,9 +57,12 @@ class Simulator:
         if members < 1:
             raise ValueError(f"a simulation needs at least one member, got {members}")
         generator = torch.Generator(device=self.device).manual_seed(seed)
-        one = seed_particles(self, time, generator)
-        return self.resume(one.repeated(members), time)
+        backend = choose_backend(self.backend, self.device)
+        single = seed_particles(self.domain, backend, time, generator, self.seeding)
+        return self.resume(single.repeated(members), time)
 
     def resume(self, particles: Particles, time: float) -> Simulation:
         """Run on with particles in internal units that were made elsewhere."""
-        return Simulation(self, particles, time)
+        run = Simulation(self.domain, choose_backend(self.backend, self.device), particles, time)
+        run.simulator = self
+        return run

@@ -11,53 +11,38 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from torchsph.pairs.interface import inner, per_particle, square_length
+from torchsph.pairs.vectors import per_particle
 
-from .schemes.weakly_compressible import CompleteKernelWall, PotentialWall
+from .domain import Domain
 from .state.particles import Particles
 from .state.record import Record
-from .state.units import Units
-from .walls.forces import WallSample, friction_rate, potential_force, retardation
+from .walls.interface import FluidAtWalls, WallSample
+from .walls.registry import wall_forces
 
 if TYPE_CHECKING:
-    from .domain import Domain
-    from .stepping.projection import ProjectionStepper
-    from .stepping.weakly_compressible import Stepper
-
-
-def energy_unit(units: Units, density: float, dimension: int) -> float:
-    """J (in a plane J/m) per internal energy, which counts masses in those of a spacing^D of fluid at rest density."""
-    return density * units.length**dimension * units.speed**2
-
-
-def carried_energy(particles: Particles, pressure: Tensor) -> Tensor:
-    """What particles carry through an opening: kinetic energy and the work p V of the pressure (N,), internal."""
-    per_mass = 0.5 * square_length(particles.velocity) + pressure / (1.0 + particles.deviation)
-    return (particles.mass * per_mass).double()
+    from .stepping.protocols import Stepper
 
 
 class WorkAccount:
     """Adds the work of each step to a record.
 
     Pressure does the work  int p v_wall . n dA,  as a sum over the particles whose kernels the wall cuts: the kernel's
-    integral over the wall is the gradient of its share inside (Ferrand et al. 2013), and half of a kernel centred on a
+    integral over the wall is the gradient of its completeness (Ferrand et al. 2013), and half of a kernel centred on a
     plane wall lies inside. Where the wall is curved or folded that half is off by the curvature over a kernel's radius.
     A potential wall does the work of the force and the retardation that particles feel. What walls do to particles that
     they stop outright is added where that happens (``Domain.constrain``).
     """
 
     def __init__(self, domain: Domain, record: Record) -> None:
-        self._record, self._wall = record, domain.scheme.wall
-        self._friction = isinstance(self._wall, CompleteKernelWall) and self._wall.no_slip
-        self._sources = domain.sources
-        self._moving = domain.walls is not None and bool(domain.scene.walls.rates_at_keys.any())
-        self._unit = energy_unit(domain.units, domain.scene.fluid.density, domain.scene.dimension)
+        self._record, self._walls = record, wall_forces(domain.scheme.wall)
+        self._moving = domain.walls is not None and bool(domain.walls.motion.rates_at_keys.any())
+        self._unit = domain.energy_unit
 
     @classmethod
     def of(cls, domain: Domain, record: Record) -> WorkAccount | None:
         """The account of a scene; None where nothing can do work, so that it costs nothing."""
         account = cls(domain, record)
-        return account if account._moving or account._sources is not None else None
+        return account if account._moving or domain.valves.does_work else None
 
     def note(
         self,
@@ -65,20 +50,25 @@ class WorkAccount:
         stepped: Particles,
         wall: WallSample | None,
         step: Tensor,
-        stepper: Stepper | ProjectionStepper,
+        stepper: Stepper,
         counts: Tensor,
+        by_valves: Tensor | None,
     ) -> None:
         """Account for one step.
 
         Args:
             before, stepped: the particles before the step and after it, not yet stopped by walls.
-            wall: what they saw. step: (members,), internal. counts: (members,) bool, whose steps were taken.
+            wall: what they saw.
+            step: (members,), internal.
+            stepper: what knows pressure and coefficients.
+            counts: (members,) bool, whose steps were taken.
+            by_valves: (N, D), acceleration by pressure sources, or None.
         """
         if self._moving and wall is not None:
             power = self._power_of_walls(before, stepped, wall, step, stepper) * stepped.mass * stepped.inside
             self._add("wall_work", stepped.per_member(power, "sum"), step, counts)
-        if self._sources is not None and self._sources.push is not None:
-            power = 0.5 * before.mass * (self._sources.push * (before.velocity + stepped.velocity)).sum(1)
+        if by_valves is not None:
+            power = 0.5 * before.mass * (by_valves * (before.velocity + stepped.velocity)).sum(1)
             self._add("source_work", before.per_member(power.double(), "sum"), step, counts)
 
     def _add(self, name: str, power: Tensor, step: Tensor, counts: Tensor) -> None:
@@ -92,22 +82,16 @@ class WorkAccount:
         stepped: Particles,
         wall: WallSample,
         step: Tensor,
-        stepper: Stepper | ProjectionStepper,
+        stepper: Stepper,
     ) -> Tensor:
         """Power per mass (N,) of the walls on the particles, internal; few passes, because every step pays for them."""
         c = stepper.coefficients
-        if isinstance(self._wall, PotentialWall):
-            sound = per_particle(c.sound_speed, stepped.member)
-            force = potential_force(self._wall, sound, wall)
-            if self._wall.relaxation is not None:
-                # a step backwards from where it has led gives what it has changed
-                dt = per_particle(step, stepped.member)
-                change = stepped.velocity - retardation(self._wall, sound, -dt, stepped.velocity, wall)
-                force = force + change / dt.clamp_min(torch.finfo(dt.dtype).tiny)[:, None]
-            return inner(force, wall.velocity)
-        swept = inner(wall.velocity, wall.share_gradient) if wall.swept is None else wall.swept
-        power = 2.0 * stepper.pressure(stepped) / (1.0 + stepped.deviation) * swept
-        if self._friction and c.viscosity is not None:
-            rate = friction_rate(per_particle(c.viscosity, stepped.member), wall)
-            power = power + rate * (square_length(wall.velocity) - inner(before.velocity, wall.velocity))
-        return power
+        fluid = FluidAtWalls(
+            stepped.velocity,
+            stepped.deviation,
+            stepped.member,
+            pressure=stepper.pressure(stepped),
+            sound_speed=c.sound_speed,
+            viscosity=c.viscosity,
+        )
+        return self._walls.power(before.velocity, fluid, wall, per_particle(step, stepped.member))

@@ -1,9 +1,10 @@
 """Ultrasound: from flow to echoes and back to velocities, and a noise model of the whole for sweeps.
 
-Simulation (flow, scatterers, image, echoes) and estimation (clutter, tracking, doppler) meet in IQ packets
-alone: no estimator imports the simulator. Measurements join the two on a recording.
+The simulated scanner (`scanner`) and the estimators (`estimation`) meet in the IQ packets of `acquisition` alone:
+neither imports the other. `measurements` joins the two on a recording.
 """
 
+from .acquisition import Acquisition, Beams, Packet
 from .estimation.clutter import ClutterFilter, FIRFilter, PolynomialFilter, SVDFilter
 from .estimation.doppler import ColourDoppler, DopplerEstimates, colour_doppler, vector_doppler
 from .estimation.estimates import Estimates, Flag
@@ -14,7 +15,6 @@ from .measurements.doppler import DopplerOptions, measure_doppler
 from .measurements.noise import NoiseModel, measure_noise
 from .measurements.speckle import SpeckleOptions, measure_speckle
 from .measurements.training import SwirlFlow, TrainingPlan, calibrate, random_scene, random_swirl
-from .scanner.acquisition import Acquisition, Beams, Packet
 from .scanner.echoes import EchoModel, simulate_packet
 from .scanner.flow import Flow, LinearFlow, RecordingFlow
 from .scanner.pointspread import GaussianPointSpread, PointSpread, SampledPointSpread, SectorPointSpread

@@ -1,8 +1,8 @@
 """Volumes from and to the Ultrasound File Format (UFF), as beamformed data of the `pyuff_ustb` package.
 
-Bernard et al., IEEE IUS 2018. The package is an optional extra: `pip install torchsph[uff]`. Pixels may
-come in any order; they must fill a regular grid. In a plane, UFF's z is our second axis, y. IQ is complex
-with one channel; a velocity is real with one channel per component.
+Bernard et al. 2018. The package is an optional extra: `pip install torchsph[uff]`. Pixels may come in any order;
+they must fill a regular grid. In a plane, UFF's z is our second axis, y. IQ is complex with one channel; a velocity
+is real with one channel per component.
 """
 
 from __future__ import annotations
@@ -16,15 +16,18 @@ import torch
 
 from geometry import Grid
 
-from .scanner.acquisition import Acquisition, Beams, Packet
+from .acquisition import Acquisition, Beams, Packet
 
 
 @dataclass(frozen=True, eq=False)
 class UffVolumes:
-    """``values`` (T, C, *shape), complex IQ (C = 1) or real components, on ``grid``.
+    """Volumes on a grid, as UFF's beamformed data hold them.
 
-    frame_rate: Hz (UFF stores whole numbers). modulation_frequency: Hz. Both ``None`` where the file has
-    none.
+    Args:
+        values: (T, C, *shape), complex IQ (C = 1) or real components.
+        grid: where the values lie.
+        frame_rate: Hz (UFF stores whole numbers); ``None`` where the file has none.
+        modulation_frequency: Hz; ``None`` where the file has none.
     """
 
     values: np.ndarray
@@ -33,7 +36,16 @@ class UffVolumes:
     modulation_frequency: float | None = None
 
     def packet(self, beams: Beams, *, sound_speed: float = 1540.0, noise: float | None = None) -> Packet:
-        """The volumes as a packet to track; ValueError if they are no IQ or lack their rates."""
+        """The volumes as a packet to track.
+
+        Args:
+            beams: along which the samples were taken; UFF's beamformed data do not say.
+            sound_speed: m/s.
+            noise: power of the thermal noise per sample, if known.
+
+        Raises:
+            ValueError: where they are no IQ or lack their rates.
+        """
         if not np.iscomplexobj(self.values) or self.values.shape[1] != 1:
             raise ValueError("these UFF volumes are no IQ: they must be complex with one channel")
         if self.frame_rate is None or self.modulation_frequency is None:
@@ -43,10 +55,16 @@ class UffVolumes:
 
 
 def read_uff(path: str | Path, name: str = "beamformed_data") -> UffVolumes:
-    """Read beamformed data ``name`` of a UFF file.
+    """Read beamformed data of a UFF file.
 
-    Raises FileNotFoundError, ImportError without pyuff_ustb, and ValueError where the data are missing or
-    their pixels do not fill a regular grid.
+    Args:
+        path: of the file.
+        name: of the object in it.
+
+    Raises:
+        FileNotFoundError: where there is no such file.
+        ImportError: without pyuff_ustb.
+        ValueError: where the data are missing or their pixels do not fill a regular grid.
     """
     if not Path(path).is_file():
         raise FileNotFoundError(f"no UFF file at {path}")
@@ -60,17 +78,26 @@ def read_uff(path: str | Path, name: str = "beamformed_data") -> UffVolumes:
     pixels = np.asarray(found.scan.xyz, np.float64)
     grid, order = regular_grid(pixels, f"{path}: {name!r}")
     data = np.asarray(found.data)
-    data = data.reshape(data.shape + (1,) * (4 - data.ndim))
-    if data.shape[2] != 1:
-        raise ValueError(f"{path}: {name!r} holds {data.shape[2]} waves; compound them first")
-    values = data[order][:, :, 0].transpose(2, 1, 0).reshape(data.shape[3], data.shape[1], *grid.shape)
+    pixels_channels_waves_frames = data.shape + (1,) * (4 - data.ndim)
+    _, channels, waves, images = pixels_channels_waves_frames
+    if waves != 1:
+        raise ValueError(f"{path}: {name!r} holds {waves} waves; compound them first")
+    values = data.reshape(pixels_channels_waves_frames)[order][:, :, 0].transpose(2, 1, 0)
+    values = values.reshape(images, channels, *grid.shape)
     return UffVolumes(values, grid, _number(found.frame_rate), _number(found.modulation_frequency))
 
 
 def write_uff(path: str | Path, volumes: UffVolumes, name: str = "beamformed_data") -> None:
-    """Write beamformed data ``name`` into a UFF file, replacing what has that name.
+    """Write beamformed data into a UFF file, replacing what has their name.
 
-    Raises ImportError without pyuff_ustb and ValueError for a frame rate that is no whole number of Hz.
+    Args:
+        path: of the file, which is made if there is none.
+        volumes: what to write.
+        name: of the object in the file.
+
+    Raises:
+        ImportError: without pyuff_ustb.
+        ValueError: for a frame rate that is no whole number of Hz.
     """
     pyuff = _pyuff()
     rate = volumes.frame_rate
@@ -91,10 +118,16 @@ def write_uff(path: str | Path, volumes: UffVolumes, name: str = "beamformed_dat
 
 
 def regular_grid(pixels: np.ndarray, source: str) -> tuple[Grid, np.ndarray]:
-    """The grid that ``pixels`` (n, 3), m, fill in any order, and the order that sorts them as its array is.
+    """The grid that pixels fill in any order, and the order (n,) that sorts them as its array is.
 
-    A constant y makes a plane, and z its second axis. Raises ValueError where nodes are missing, doubled
-    or uneven.
+    A constant y makes a plane, and z its second axis.
+
+    Args:
+        pixels: (n, 3), m.
+        source: what the error calls them.
+
+    Raises:
+        ValueError: where nodes are missing, doubled or uneven.
     """
     flat = np.ptp(pixels[:, 1]) < 1e-9
     columns = pixels[:, [0, 2]] if flat else pixels
@@ -104,7 +137,9 @@ def regular_grid(pixels: np.ndarray, source: str) -> tuple[Grid, np.ndarray]:
         distinct = np.unique(np.round((column - low) / 1e-9).astype(np.int64))
         count = len(np.flatnonzero(np.diff(distinct) > 10)) + 1  # nodes closer than 10 nm are the same
         step = span / (count - 1) if count > 1 else 1e-3
-        origin.append(low), spacing.append(step), counts.append(count)
+        origin.append(low)
+        spacing.append(step)
+        counts.append(count)
         place = (column - low) / step
         if np.abs(place - place.round()).max() > 0.01:
             raise ValueError(f"{source}: the pixels are not evenly spaced; resample them to a regular grid")

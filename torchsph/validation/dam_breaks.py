@@ -14,6 +14,7 @@ from torchsph.simulator.simulator import Simulator
 
 from .exact_flows import FREE_SURFACE_OPTIONS
 from .free_surface import resting_block, wall_pressure
+from .options import WeaklyCompressibleOptions
 
 GRAVITY = 9.81  # m/s^2
 
@@ -31,20 +32,27 @@ KOSHIZUKA_OKA_1996 = np.array(
     ]
 )
 
-# SPHERIC test 2 (Kleefsman et al. 2005 section 6): tank, column, obstacle (lower and upper corner), probes P1, P3; m.
+# SPHERIC test 2 (Kleefsman et al. 2005, sec. 6): tank, column, obstacle (lower and upper corner), probes P1, P3; m.
 OBSTACLE_TANK = ((0.0, -0.5, 0.0), (3.22, 0.5, 1.0))
 OBSTACLE_COLUMN = ((0.0, -0.5, 0.0), (1.228, 0.5, 0.55))
 OBSTACLE = ((2.42, -0.2, 0.0), (2.58, 0.2, 0.161))
 OBSTACLE_PROBES = ((2.42, 0.0, 0.021), (2.42, 0.0, 0.101))
 # Waves that hit walls: without this damping single particles at the obstacle ring with 5 rho g H (chosen on P1 and P3)
-IMPACT_OPTIONS = FREE_SURFACE_OPTIONS | {"smoothing_ratio": 1.6, "bulk_damping": 1.0, "artificial_viscosity": 0.1}
+IMPACT_OPTIONS: WeaklyCompressibleOptions = {
+    **FREE_SURFACE_OPTIONS,
+    "smoothing_ratio": 1.6,
+    "bulk_damping": 1.0,
+    "artificial_viscosity": 0.1,
+}
 
 
 def column_scene(spacing: float, width: float = 1.0, *, viscosity: float = 0.001) -> Scene:
     """A tank of 4 x 4 widths for a column of water of ``width`` (m), twice as high, in its left corner.
 
     Args:
-        spacing: of the particles, m. viscosity: dynamic, Pa s.
+        spacing: of the particles, m.
+        width: of the column, m.
+        viscosity: dynamic, Pa s.
     """
     corners = 4.0 * width * np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float64)
     return Scene(
@@ -63,7 +71,7 @@ def obstacle_scene(spacing: float) -> Scene:
     # the obstacle reaches through the floor, so that its bottom is no wall that a particle sees
     depth = 2 * spacing
     lower, upper = np.array(OBSTACLE[0]) - (0.0, 0.0, depth), np.array(OBSTACLE[1])
-    block = geometry.box(lower, upper, 2 * spacing)
+    block = geometry.box(lower.tolist(), upper.tolist(), 2 * spacing)
     # its top comes first: a surface's check asks for the first vertex of a piece whether the piece lies in another
     inward = block.faces[np.argsort(-block.vertices[block.faces, 2].mean(1), kind="stable"), ::-1]
     walls = geometry.Surface(
@@ -108,7 +116,12 @@ def front_error(time: np.ndarray, front: np.ndarray, measured: np.ndarray) -> fl
     """Mean of |computed / measured - 1| over the measured rows inside the times that were computed.
 
     Args:
-        time: (n,) t sqrt(2 g / a). front: (n,) x / a. measured: (2, m), ``MARTIN_MOYCE_1952`` or the other.
+        time: (n,), t sqrt(2 g / a).
+        front: (n,), x / a.
+        measured: (2, m), ``MARTIN_MOYCE_1952`` or ``KOSHIZUKA_OKA_1996``.
+
+    Raises:
+        ValueError: nothing was measured inside these times.
     """
     inside = (measured[0] >= time[0]) & (measured[0] <= time[-1])
     if not inside.any():

@@ -10,8 +10,10 @@ from scipy.special import eval_legendre
 
 import geometry
 from torchsph.simulator.scene import Fluid, Scene, Valve
-from torchsph.simulator.schemes.presets import Scheme, preset
-from torchsph.simulator.schemes.weakly_compressible import CompleteKernelWall
+from torchsph.simulator.schemes.presets import preset
+from torchsph.simulator.schemes.scheme import Scheme
+from torchsph.simulator.schemes.valve_models import Reservoir
+from torchsph.simulator.schemes.wall_models import CompleteKernelWall
 from torchsph.simulator.simulation import Simulation
 from torchsph.simulator.simulator import Simulator
 
@@ -28,9 +30,12 @@ class PulsatingEllipsoid:
     (1 - p) of the first one in closed form. The plane is the opening (region 1); it is open all the time.
 
     Attributes:
-        radius, height: semi-axes across and along z at t = 0, m. opening: polar angle of the opening's rim, degrees,
-            on the sphere that the affine motion makes of the spheroid.
-        stroke: part of the volume that is ejected. period: s. share: k, what the width takes of the volume's change.
+        radius: semi-axis across z at t = 0, m.
+        height: semi-axis along z at t = 0, m.
+        opening: polar angle of the opening's rim, degrees, on the sphere that the affine motion makes of the spheroid.
+        stroke: part of the volume that is ejected.
+        period: s.
+        share: k, what the width takes of the volume's change.
     """
 
     radius: float = 8e-3
@@ -108,10 +113,17 @@ class PulsatingEllipsoid:
         return float(((speed[core] - exact) ** 2).sum(1).mean()), float((exact**2).sum(1).mean())
 
     def missing(self, run: Simulation) -> float:
-        """Part of the cavity's volume that the particles fall short of; what stands in the opening counts in part."""
-        run.domain.at(run.time)
-        valves = run.domain.reservoirs
-        return float(valves.shortfall(run.particles)) * valves.relaxation
+        """Part of the cavity's volume that the particles fall short of; what stands in the opening counts in part.
+
+        Raises:
+            ValueError: the run has no ``Reservoir`` with a relaxation.
+        """
+        run.surroundings.at(run.time)
+        rate = run.domain.valves.volume_deficit_rate(run.particles, run.surroundings.clock)
+        valve = run.domain.scheme.valve
+        if not isinstance(valve, Reservoir) or valve.relaxation is None:
+            raise ValueError("what is missing is known to a Reservoir with a relaxation only")
+        return float(rate) * valve.relaxation
 
     def flow(self, time: float, order: int = 40) -> PotentialFlow:
         """The potential flow at ``time`` (s): the wall's normal velocity, a plug through the opening."""
@@ -129,8 +141,12 @@ class PotentialFlow:
     (the Trefftz method, e.g. Kita & Kamiya 1995).
 
     Attributes:
-        radius, height: semi-axes now, m. plane: the cut's height in semi-axes. strain: (3,), 1/s.
-        rate: dV/dt, m^3/s. order: highest n.
+        radius: present semi-axis across z, m.
+        height: present semi-axis along z, m.
+        plane: the cut's height in semi-axes.
+        strain: (3,), 1/s.
+        rate: dV/dt, m^3/s.
+        order: highest n.
     """
 
     radius: float

@@ -9,21 +9,19 @@ import torch
 from torch import Tensor
 
 import geometry
-from torchsph.pairs import backend as choose_backend
-from torchsph.simulator.imposing import fetch_at
+from torchsph.pairs import choose_backend
+from torchsph.pairs.moving_least_squares import fetch_at
 from torchsph.simulator.scene import Fluid, Scene
-from torchsph.simulator.schemes.presets import Scheme
+from torchsph.simulator.schemes.scheme import Scheme
 from torchsph.simulator.schemes.weakly_compressible import WeaklyCompressible
 from torchsph.simulator.seeding import Seeding
-from torchsph.simulator.simulation import Simulation
+from torchsph.simulator.simulation import FETCH_RADIUS, Simulation
 from torchsph.simulator.simulator import Simulator
 
-from . import exact_flows as validation
+from . import exact_flows
 
 _LATTICE = Seeding(jitter=0.0)
 _CHANNEL_VISCOSITY = 0.1
-# radius, in spacings, of the fits that read velocities off at points
-_FETCH_RADIUS = 2.0
 
 
 def taylor_green(
@@ -37,13 +35,20 @@ def taylor_green(
 ) -> Simulation:
     """A Taylor-Green vortex on resolution^dimension particles at its start: velocity and pressure as they should be.
 
-    In the plane the period is 1 m, in space 2 pi m; U = 1 m/s and nu = 1 / reynolds m^2/s. ``scheme`` defaults to
-    the options for periodic flows.
+    In the plane the period is 1 m, in space 2 pi m; U = 1 m/s and nu = 1 / reynolds m^2/s.
+
+    Args:
+        resolution: particles along each axis.
+        reynolds: Reynolds number.
+        dimension: 2 or 3.
+        scheme: None: the weakly compressible one with the options for periodic flows.
+        backend: name of the pair backend.
+        seeding: how particles are placed.
     """
     plane = dimension == 2
     side = 1.0 if plane else 2 * math.pi
     if scheme is None:
-        options = validation.PERIODIC_OPTIONS if plane else validation.PERIODIC_OPTIONS_3D
+        options = exact_flows.PERIODIC_OPTIONS if plane else exact_flows.PERIODIC_OPTIONS_3D
         scheme = WeaklyCompressible(**options)
     scene = Scene(
         spacing=side / resolution, fluid=Fluid(1.0, 1 / reynolds), period=(side,) * dimension, dimension=dimension
@@ -51,12 +56,13 @@ def taylor_green(
     run = Simulator(scene, scheme, backend=backend, seeding=seeding).start(0.0)
     points = run.particles.position * scene.spacing
     if plane:
-        velocity = validation.taylor_green_2d(points, 0.0, 1 / reynolds)
-        pressure = validation.taylor_green_2d_pressure(points, 0.0, 1 / reynolds)
+        velocity = exact_flows.taylor_green_2d(points, 0.0, 1 / reynolds)
+        pressure = exact_flows.taylor_green_2d_pressure(points, 0.0, 1 / reynolds)
     else:
-        velocity, pressure = validation.taylor_green_3d(points), validation.taylor_green_3d_pressure(points)
-    # an incompressible fluid finds its pressure by itself
-    deviation = torch.zeros_like(pressure) if scheme.sound_speed is None else pressure / scheme.sound_speed**2
+        velocity, pressure = exact_flows.taylor_green_3d(points), exact_flows.taylor_green_3d_pressure(points)
+    deviation = torch.zeros_like(pressure)
+    if isinstance(scheme, WeaklyCompressible):  # an incompressible fluid finds its pressure by itself
+        deviation = pressure / scheme.sound_speed**2
     run.particles = run.particles.changed(velocity=velocity, deviation=deviation)
     return run
 
@@ -64,7 +70,7 @@ def taylor_green(
 def taylor_green_error(run: Simulation) -> float:
     """Relative L2 error of the particles' velocities in a ``taylor_green`` run in the plane, at its present time."""
     points, velocity = _points(run), run.particles.velocity.double()
-    exact = validation.taylor_green_2d(points, run.time, run.simulator.scene.fluid.kinematic_viscosity)
+    exact = exact_flows.taylor_green_2d(points, run.time, run.simulator.scene.fluid.kinematic_viscosity)
     return float((velocity - exact).norm() / exact.norm())
 
 
@@ -76,7 +82,16 @@ def kinetic_energy(run: Simulation) -> float:
 def channel(flow: str, across: int, *, scheme: WeaklyCompressible | None = None, backend: str = "auto") -> Simulation:
     """A channel of width 1 m at rest that starts to flow: "poiseuille" (driven by a force) or "couette" (by a wall).
 
-    The largest speed of the steady flow is 1 m/s and nu = 0.1 m^2/s. Raises ValueError on an unknown flow.
+    The largest speed of the steady flow is 1 m/s and nu = 0.1 m^2/s.
+
+    Args:
+        flow: which of the two.
+        across: particles from wall to wall.
+        scheme: None: the weakly compressible one with the options for channels.
+        backend: name of the pair backend.
+
+    Raises:
+        ValueError: the flow is unknown.
     """
     if flow not in ("poiseuille", "couette"):
         raise ValueError(f"the flow must be 'poiseuille' or 'couette', got '{flow}'")
@@ -92,17 +107,17 @@ def channel(flow: str, across: int, *, scheme: WeaklyCompressible | None = None,
         gravity=(8 * _CHANNEL_VISCOSITY if flow == "poiseuille" else 0.0, 0.0),
         dimension=2,
     )
-    scheme = scheme or WeaklyCompressible(**validation.CHANNEL_OPTIONS)
+    scheme = scheme or WeaklyCompressible(**exact_flows.CHANNEL_OPTIONS)
     return Simulator(scene, scheme, backend=backend, seeding=_LATTICE).start(0.0)
 
 
 def channel_error(run: Simulation) -> float:
     """RMS error of the velocity along a ``channel``, m/s (the largest speed is 1 m/s), at the present time."""
-    force, height = run.simulator.scene.gravity[0], _points(run)[:, 1]
+    force, height = run.simulator.scene.gravity_at(run.time)[0], _points(run)[:, 1]
     if force:
-        exact = validation.poiseuille_start(height, run.time, _CHANNEL_VISCOSITY, force, 1.0)
+        exact = exact_flows.poiseuille_start(height, run.time, _CHANNEL_VISCOSITY, force, 1.0)
     else:
-        exact = validation.couette_start(height, run.time, _CHANNEL_VISCOSITY, 1.0, 1.0)
+        exact = exact_flows.couette_start(height, run.time, _CHANNEL_VISCOSITY, 1.0, 1.0)
     return float((run.particles.velocity[:, 0].double() - exact).square().mean().sqrt())
 
 
@@ -114,7 +129,7 @@ def lid_driven_cavity(across: int, reynolds: float, *, scheme: WeaklyCompressibl
     # the corners belong to the walls at rest: the lid must not drag fluid through them
     drive = np.where(np.isclose(y, 1.0) & ~np.isclose(x, 0.0) & ~np.isclose(x, 1.0), 1.0, 0.0)
     scene = Scene(spacing=spacing, fluid=Fluid(1.0, 1 / reynolds), walls=_driven(surface, drive), dimension=2)
-    return Simulator(scene, scheme or WeaklyCompressible(**validation.CAVITY_OPTIONS)).start(0.0)
+    return Simulator(scene, scheme or WeaklyCompressible(**exact_flows.CAVITY_OPTIONS)).start(0.0)
 
 
 def velocity_at(run: Simulation, points: np.ndarray) -> np.ndarray:
@@ -123,7 +138,7 @@ def velocity_at(run: Simulation, points: np.ndarray) -> np.ndarray:
     at = torch.as_tensor(points / run.simulator.scene.spacing, dtype=p.position.dtype)
     member = torch.zeros(len(at), dtype=torch.int64)
     return (
-        fetch_at(backend, at, member, p.position, p.member, p.velocity, _FETCH_RADIUS, period=run.domain.period)
+        fetch_at(backend, at, member, p.position, p.member, p.velocity, FETCH_RADIUS, period=run.domain.period)
         .value.double()
         .numpy()
     )

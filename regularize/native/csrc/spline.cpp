@@ -9,6 +9,8 @@
 #include <cstring>
 #include <vector>
 
+#include "processor.hpp"
+
 #ifdef _OPENMP
 #include <omp.h>
 #endif
@@ -303,15 +305,7 @@ PullCell pull_cell_for(const SplineGrid& g) {
 
 extern "C" {
 
-// 2: AVX-512, 1: AVX2 with FMA, 0: neither. Asked of the portable build to choose among the three.
-int32_t spline_cpu_level() {
-#if defined(__x86_64__)
-  __builtin_cpu_init();
-  if (__builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512dq")) return 2;
-  if (__builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma")) return 1;
-#endif
-  return 0;
-}
+int32_t spline_runs(const char* instruction_set) { return processor_runs(instruction_set); }
 
 int32_t spline_tile_width() { return kCols; }
 

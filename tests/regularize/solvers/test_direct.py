@@ -9,6 +9,7 @@ from regularize_cases import blocks_of, make
 from regularize import BlockFactor, InvalidInput, Knots, PreparedSystem, System, VectorRows, lsqr, solve_direct
 from regularize.native import build as native_build
 from regularize.native import library as native
+from regularize.native import loader
 
 ENGINES = [
     "reference",
@@ -47,15 +48,15 @@ def test_band_and_gradient_equal_dense_products(axes, degree, engine):
     assert prepared.factor().log_determinant() == pytest.approx(log_determinant, rel=1e-10)
 
 
-@pytest.mark.parametrize("level", ["base", "avx2", "avx512"])
-def test_every_compiled_variant_agrees(level, tmp_path, monkeypatch):
+@pytest.mark.parametrize("instruction_set", loader.PREFERENCE)
+def test_every_compiled_variant_agrees(instruction_set, tmp_path, monkeypatch):
     if shutil.which("g++") is None or not native.available():
         pytest.skip("no compiler here")
-    if native.LEVELS.index(level) > native.library().spline_cpu_level():
+    if not native.library().spline_runs(instruction_set.encode()):
         pytest.skip("this processor cannot run it")
     knots, blocks = blocks_of(3)
     prepared = PreparedSystem(System(knots, 3, list(blocks.values()), 0.3), engine="reference")
-    monkeypatch.setenv("TORCHSPH_SPLINE_LEVEL", level)
+    monkeypatch.setenv(loader.FORCED, instruction_set)
     native.library.cache_clear()
     try:
         compiled = PreparedSystem(prepared.system, engine="native")
@@ -64,13 +65,27 @@ def test_every_compiled_variant_agrees(level, tmp_path, monkeypatch):
         native.library.cache_clear()
 
 
-def test_build_makes_loadable_libraries(tmp_path):
+def test_an_instruction_set_that_does_not_exist_is_refused(monkeypatch):
+    if not native.available():
+        pytest.skip("nothing was compiled here")
+    monkeypatch.setenv(loader.FORCED, "avx1024")
+    native.library.cache_clear()
+    try:
+        with pytest.raises(
+            loader.LibraryMissing, match="TORCHSPH_ISA=avx1024 is unknown; known: avx512, avx2, baseline"
+        ):
+            native.library()
+    finally:
+        native.library.cache_clear()
+
+
+def test_build_makes_loadable_libraries(tmp_path, monkeypatch):
     if shutil.which("g++") is None:
         pytest.skip("no compiler here")
     made = native_build.build(tmp_path)
-    assert made[0].name == "_native_base.so" and all(path.exists() for path in made)
-    with pytest.raises(FileNotFoundError):
-        native_build.build(tmp_path, compiler="no-such-compiler")
+    assert made[0].name == "splines_baseline.so" and all(path.exists() for path in made)
+    monkeypatch.setenv("CXX", "no-such-compiler")
+    assert native_build.build(tmp_path) == []
 
 
 @pytest.mark.parametrize("axes,degree", [(2, 3), (3, 2), (3, 3), (2, 1)])

@@ -5,7 +5,7 @@ import torch
 from scipy.stats import chi2
 
 from torchsph.assimilation import ETKF, RTPS, AssimilationError, ErrorScale, Observations
-from torchsph.assimilation.tuning.error_scale import _MEDIAN
+from torchsph.assimilation.diagnostics.scores import CHI2_MEDIAN
 from torchsph.assimilation.twins.models import Lorenz96
 
 
@@ -19,7 +19,7 @@ def cycle(draw, sigma, outliers=0.0, count=400):
 
 
 def test_the_median_is_scipys():
-    assert chi2.median(1) == pytest.approx(_MEDIAN, abs=1e-14)
+    assert chi2.median(1) == pytest.approx(CHI2_MEDIAN, abs=1e-14)
 
 
 @pytest.mark.parametrize("outliers", [0.0, 0.1])

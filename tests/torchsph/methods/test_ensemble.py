@@ -7,6 +7,7 @@ import pytest
 import torch
 
 import geometry
+from geometry.grids.fields import fwhm_to_deviation, smooth_noise
 from regularize import Smoother
 from torchsph import EnsembleOptions, Simulator, assimilate, estimate_error, filter_sph, preset
 from torchsph.data import sample_measurement, sample_truth
@@ -15,7 +16,6 @@ from torchsph.methods.frame_splines import FrameSmoother, node_weights, smooth_f
 from torchsph.methods.measurement.error_model import kernel_width
 from torchsph.methods.wall_rows import flux_shares, open_regions, wall_rows
 from torchsph.simulator.scene import Scene
-from torchsph.ultrasound.estimation.box_sums import fwhm_to_deviation, smooth_noise
 
 
 @pytest.fixture(scope="module")

@@ -15,10 +15,9 @@ CASES = [("lv_phantom_a_measured.h5", 0.602, 0.88), ("lv_phantom_a_noisy.h5", 0.
 
 
 @pytest.mark.slow  # half a minute each
+@pytest.mark.phantom("lv_phantom_a.h5", *(name for name, _, _ in CASES))
 @pytest.mark.parametrize("name,gaussian,share", CASES)
 def test_automatic_spline_beats_gaussian_smoothing(name, gaussian, share):
-    if not (SHARED_DATA / name).exists():
-        pytest.skip(f"no phantom at {SHARED_DATA}")
     measured, truth = (
         geometry.read_recording(SHARED_DATA / name),
         geometry.read_recording(SHARED_DATA / "lv_phantom_a.h5"),

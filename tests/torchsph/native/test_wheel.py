@@ -44,7 +44,7 @@ def test_without_a_compiler_nothing_is_added_and_it_is_said(monkeypatch, tmp_pat
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.delenv("CXX", raising=False)
     compile_with = runpy.run_path(str(BACKEND))["_compile"]
-    assert compile_with("torchsph/pairs/build.py", tmp_path / "out") == []
+    assert compile_with("torchsph/native/build.py", tmp_path / "out") == []
     assert "no C++ compiler found" in capsys.readouterr().err
 
 
@@ -55,5 +55,5 @@ def test_compiler_that_fails_does_not_stop_the_install(monkeypatch, tmp_path, ca
     monkeypatch.setenv("PATH", f"{tmp_path}:/usr/bin:/bin")
     monkeypatch.delenv("CXX", raising=False)
     compile_with = runpy.run_path(str(BACKEND))["_compile"]
-    assert compile_with("torchsph/pairs/build.py", tmp_path / "out") == []
+    assert compile_with("torchsph/native/build.py", tmp_path / "out") == []
     assert "no OpenMP here" in capsys.readouterr().err

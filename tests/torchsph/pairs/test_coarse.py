@@ -7,7 +7,7 @@ import torch
 from pair_cases import disordered, support
 
 from torchsph.native.library import LibraryMissing
-from torchsph.pairs import backend
+from torchsph.pairs import choose_backend
 
 RADIUS = 2.6
 
@@ -15,7 +15,7 @@ RADIUS = 2.6
 @pytest.fixture(scope="module")
 def backends():
     try:
-        return backend("cpu"), backend("reference")
+        return choose_backend("cpu"), choose_backend("reference")
     except LibraryMissing as missing:
         pytest.skip(str(missing))
 

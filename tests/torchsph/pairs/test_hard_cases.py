@@ -9,7 +9,7 @@ import torch
 from pair_cases import as_dtype, assert_close, changed, disordered, support
 
 from torchsph.pairs import MomentumTerms, PairState, RateTerms, ReferenceBackend
-from torchsph.pairs.registry import available_backends, backend
+from torchsph.pairs.registry import available_backends, choose_backend
 
 DTYPES = [torch.float32, torch.float64]
 RATES = RateTerms("volume", True, True, True, True, True)
@@ -22,7 +22,7 @@ PRESENT = {status.name: status for status in available_backends()}
 def either(request):
     if not PRESENT[request.param].present:
         pytest.skip(f"backend '{request.param}': {PRESENT[request.param].reason}")
-    return backend(request.param)
+    return choose_backend(request.param)
 
 
 def random_state(position: torch.Tensor, member: torch.Tensor | None = None) -> PairState:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -14,9 +15,10 @@ import torch
 from pair_cases import as_dtype, assert_close, disordered, support
 
 import torchsph
+from regularize.native import loader
 from torchsph.native import build
 from torchsph.native import library as native
-from torchsph.pairs import MomentumTerms, RateTerms, ReferenceBackend, available_backends, backend, registry
+from torchsph.pairs import MomentumTerms, RateTerms, ReferenceBackend, available_backends, choose_backend, registry
 from torchsph.pairs.backends import cpu_operators as operators
 from torchsph.pairs.backends import plan
 from torchsph.pairs.smoothing_kernels import SmoothingKernel, truncated_gaussian
@@ -39,7 +41,7 @@ class TestOperators:
 
     def test_pass(self):
         state = disordered(5, 3, torch.float32)
-        lists = backend("cpu").search(state.position, state.member, 2.4).lists
+        lists = choose_backend("cpu").search(state.position, state.member, 2.4).lists
         terms = plan.CONTINUITY | plan.CONCENTRATION | plan.PRESSURE
         coefficients = torch.tensor([[1.2, 0.0, 0.0, 0.0]], dtype=torch.float64)
         arrays = (
@@ -80,7 +82,7 @@ class TestOperators:
 
     def test_combination_that_is_not_compiled(self):
         state = disordered(4, 3)
-        lists = backend("cpu").search(state.position, state.member, 2.4).lists
+        lists = choose_backend("cpu").search(state.position, state.member, 2.4).lists
         coefficients = torch.ones((1, 4), dtype=torch.float64)
         arrays = (state.position, state.velocity, state.mass, state.deviation, None, None, None, None)
         terms = plan.SHEPARD | plan.XSPH
@@ -93,9 +95,9 @@ def test_first_search_does_not_wait_for_the_compiler_of_torch(tmp_path):
     """Calling an operator must not import torch._dynamo, which takes seconds."""
     lines = (
         "import sys, torch",
-        "from torchsph.pairs import backend",
+        "from torchsph.pairs import choose_backend",
         "x = torch.rand(50, 3)",
-        "backend('cpu').search(x, torch.zeros(50, dtype=torch.int64), 0.3)",
+        "choose_backend('cpu').search(x, torch.zeros(50, dtype=torch.int64), 0.3)",
         "sys.exit('torch._dynamo' in sys.modules)",
     )
     # the package that is tested here, which is the installed one where there is one, not the working directory's
@@ -107,14 +109,14 @@ def test_first_search_does_not_wait_for_the_compiler_of_torch(tmp_path):
 @needs_cpu
 class TestWrongInputs:
     def pairs(self, state):
-        return backend("cpu").search(state.position, state.member, 2.4)
+        return choose_backend("cpu").search(state.position, state.member, 2.4)
 
     def test_mixed_precision(self):
         state = disordered(4, 3, torch.float32)
         pairs = self.pairs(state)
         mixed = dataclasses.replace(state, velocity=state.velocity.double())
         with pytest.raises(TypeError, match="all arrays in float32 or all in float64"):
-            backend("cpu").rates(pairs, mixed, support("cubic", 3), RateTerms())
+            choose_backend("cpu").rates(pairs, mixed, support("cubic", 3), RateTerms())
 
     def test_half_precision(self):
         state = disordered(4, 3, torch.float16)
@@ -124,25 +126,25 @@ class TestWrongInputs:
     def test_gradient_wanted(self):
         state = disordered(4, 3)
         with pytest.raises(ValueError, match="not differentiable; use backend='reference'"):
-            backend("cpu").search(state.position.requires_grad_(), state.member, 2.4)
+            choose_backend("cpu").search(state.position.requires_grad_(), state.member, 2.4)
 
     def test_state_of_another_size(self):
         state, other = disordered(4, 3), disordered(5, 3)
         with pytest.raises(ValueError, match="pairs are of 64 particles and the state of 125"):
-            backend("cpu").rates(self.pairs(state), other, support("cubic", 3), RateTerms())
+            choose_backend("cpu").rates(self.pairs(state), other, support("cubic", 3), RateTerms())
 
     def test_kernel_that_is_not_compiled(self):
         own = SmoothingKernel("own", 2.0, lambda q: q, lambda q: q, {3: 1.0}, "nowhere")
         state = disordered(4, 3)
         choice = type(support("cubic", 3))(own, 1.2, 3)
         with pytest.raises(ValueError, match="no kernel 'own' compiled in; use backend='reference'"):
-            backend("cpu").rates(self.pairs(state), state, choice, RateTerms())
+            choose_backend("cpu").rates(self.pairs(state), state, choice, RateTerms())
 
     def test_kernel_of_a_known_name_and_another_formula(self):
         own = SmoothingKernel("cubic", 2.0, lambda q: q, lambda q: q, {3: 1.0}, "nowhere")
         state = disordered(4, 3)
         with pytest.raises(ValueError, match="no kernel 'cubic' compiled in"):
-            backend("cpu").rates(self.pairs(state), state, type(support("cubic", 3))(own, 1.2, 3), RateTerms())
+            choose_backend("cpu").rates(self.pairs(state), state, type(support("cubic", 3))(own, 1.2, 3), RateTerms())
 
     def test_smoothing_length_of_each_particle(self):
         state = disordered(4, 3)
@@ -150,20 +152,20 @@ class TestWrongInputs:
             support("cubic", 3), length=torch.full((64,), 1.2, dtype=torch.float64), per_particle=True
         )
         with pytest.raises(ValueError, match="one smoothing length per member; use backend='reference'"):
-            backend("cpu").rates(self.pairs(state), state, choice, RateTerms())
+            choose_backend("cpu").rates(self.pairs(state), state, choice, RateTerms())
 
     def test_tensile_distance_outside_the_support(self):
         state = disordered(4, 3)
         terms = MomentumTerms("symmetric", tensile=0.2, tensile_distance=5.0)
         with pytest.raises(ValueError, match="lies outside the kernel's support"):
-            backend("cpu").momentum(self.pairs(state), state, support("cubic", 3), terms)
+            choose_backend("cpu").momentum(self.pairs(state), state, support("cubic", 3), terms)
 
 
 @needs_cpu
 def test_gaussian_of_another_truncation():
     state = disordered(6, 3)
     choice = type(support("cubic", 3))(truncated_gaussian(2.5), 0.9, 3)
-    fast, reference = backend("cpu"), ReferenceBackend()
+    fast, reference = choose_backend("cpu"), ReferenceBackend()
     got = fast.rates(fast.search(state.position, state.member, choice.radius), state, choice, RateTerms(shepard=True))
     pairs = reference.search(state.position, state.member, choice.radius)
     wanted = reference.rates(pairs, state, choice, RateTerms(shepard=True))
@@ -174,16 +176,16 @@ def test_gaussian_of_another_truncation():
 class TestChoice:
     def test_best_present_comes_first(self):
         best = next(status for status in available_backends() if status.present)
-        assert backend("auto").name == best.name
+        assert choose_backend("auto").name == best.name
         assert available_backends()[-1].name == "reference" and available_backends()[-1].present
 
     def test_unknown_name(self):
         with pytest.raises(ValueError, match="unknown backend 'warp'; known: auto, .*cpu, reference"):
-            backend("warp")
+            choose_backend("warp")
 
     def test_cpu_backend_for_another_device(self):
         with pytest.raises(ValueError, match="'cpu' was asked for and cannot be used: .*device asked for is 'cuda'"):
-            backend("cpu", "cuda")
+            choose_backend("cpu", "cuda")
 
     def test_without_libraries(self, monkeypatch, tmp_path):
         monkeypatch.setattr(build, "LIBRARIES", tmp_path)
@@ -191,20 +193,20 @@ class TestChoice:
         try:
             status = next(s for s in available_backends() if s.name == "cpu")
             assert not status.present and "python -m torchsph.native.build" in status.reason
-            assert backend("auto").name == "reference"
+            assert choose_backend("auto").name == "reference"
             with pytest.raises(ValueError, match="found no C\\+\\+ compiler.*reinstall"):
-                backend("cpu")
+                choose_backend("cpu")
         finally:
             monkeypatch.undo()
             native.library.cache_clear()
 
     def test_library_that_cannot_be_loaded(self, monkeypatch, tmp_path):
-        (tmp_path / build.library_name("baseline")).write_bytes(b"not a library")
         monkeypatch.setattr(build, "LIBRARIES", tmp_path)
+        native.family().path("baseline").write_bytes(b"not a library")
         native.library.cache_clear()
         try:
             with pytest.raises(ValueError, match="cannot be loaded.*rebuild with"):
-                registry.backend("cpu")
+                registry.choose_backend("cpu")
         finally:
             monkeypatch.undo()
             native.library.cache_clear()
@@ -216,7 +218,7 @@ class TestChoice:
         native.library.cache_clear()
         try:
             with pytest.raises(ValueError, match="TORCHSPH_ISA=avx1024 is unknown; known: avx512, avx2, baseline"):
-                backend("cpu")
+                choose_backend("cpu")
         finally:
             monkeypatch.undo()
             native.library.cache_clear()
@@ -225,13 +227,13 @@ class TestChoice:
 @needs_cpu
 def test_an_instruction_set_that_this_processor_lacks(monkeypatch):
     """Forced by name it is refused with the cure; left alone the next best library is taken."""
-    load = native._load
+    load = loader.load
 
     class Poor:
         """A library that says of this processor that it runs the baseline only."""
 
-        def __init__(self, path):
-            self._library = load(path)
+        def __init__(self, family, instruction_set):
+            self._library = load(family, instruction_set)
 
         def __getattr__(self, name):
             return getattr(self._library, name)
@@ -240,14 +242,14 @@ def test_an_instruction_set_that_this_processor_lacks(monkeypatch):
         def sph_runs(name):
             return name == b"baseline"
 
-    monkeypatch.setattr(native, "_load", Poor)
+    monkeypatch.setattr(loader, "load", Poor)
     native.library.cache_clear()
     try:
-        assert backend("auto").instruction_set == "baseline"
+        assert choose_backend("auto").instruction_set == "baseline"
         monkeypatch.setenv(native.FORCED, "avx512")
         native.library.cache_clear()
         with pytest.raises(ValueError, match="TORCHSPH_ISA=avx512 asks for instructions that this processor lacks"):
-            backend("cpu")
+            choose_backend("cpu")
     finally:
         monkeypatch.undo()
         native.library.cache_clear()
@@ -262,7 +264,7 @@ def test_every_instruction_set_equals_the_reference(instruction_set, dtype, monk
     monkeypatch.setenv(native.FORCED, instruction_set)
     native.library.cache_clear()
     try:
-        fast = backend("cpu")
+        fast = choose_backend("cpu")
         assert fast.instruction_set == instruction_set
         for dimension, name in itertools.product((2, 3), ("wendland_c2", "gaussian", "quintic")):
             compare_with_reference(fast, dimension, name, dtype)
@@ -293,21 +295,22 @@ def compare_with_reference(fast, dimension: int, name: str, dtype: torch.dtype) 
 
 
 def test_no_compiler_builds_nothing(monkeypatch, tmp_path):
-    monkeypatch.setattr(build, "compiler", lambda: None)
+    monkeypatch.delenv("CXX", raising=False)
+    monkeypatch.setenv("PATH", str(tmp_path))
     assert build.build(tmp_path) == []
 
 
 def test_compiler_that_fails_is_reported(monkeypatch, tmp_path):
-    if build.compiler() is None:
+    if not shutil.which("g++"):
         pytest.skip("no C++ compiler on this machine")
-    for name in ("pairs.cpp", "machine.cpp"):
-        (tmp_path / name).write_text("#error this machine is out of order\n")
+    for part in build.PARTS:
+        (tmp_path / part.source).write_text("#error this machine is out of order\n")
     with pytest.raises(build.BuildError, match="out of order"):
         build.build(tmp_path / "out", source=tmp_path)
 
 
 def test_missing_sources_are_reported(tmp_path):
-    if build.compiler() is None:
+    if not shutil.which("g++"):
         pytest.skip("no C++ compiler on this machine")
-    with pytest.raises(FileNotFoundError, match="pair kernels' source"):
+    with pytest.raises(FileNotFoundError, match="pairs.cpp is missing; reinstall"):
         build.build(tmp_path, source=tmp_path)

@@ -11,7 +11,7 @@ import pytest
 import torch
 from pair_cases import as_dtype, assert_close, changed, disordered, support
 
-from torchsph.pairs import MomentumTerms, RateTerms, ReferenceBackend, available_backends, backend
+from torchsph.pairs import MomentumTerms, RateTerms, ReferenceBackend, available_backends, choose_backend
 from torchsph.pairs.backends.triton_backend import CudaBackend
 from torchsph.pairs.smoothing_kernels import KERNELS
 
@@ -27,7 +27,7 @@ needs_triton = pytest.mark.skipif(
 @pytest.fixture(scope="module", name="fast")
 def _fast():
     if torch.cuda.is_available():
-        yield backend("cuda", "cuda")
+        yield choose_backend("cuda", "cuda")
         return
     before = os.environ.get("TRITON_INTERPRET")
     os.environ["TRITON_INTERPRET"] = "1"  # read when triton compiles, that is, at the first CudaBackend()
@@ -120,7 +120,7 @@ def test_missing_device_is_explained():
     assert not status.present and "CUDA tensors only" in status.reason
     if not torch.cuda.is_available():
         with pytest.raises(ValueError, match="'cuda' was asked for and cannot be used: torch finds no CUDA device"):
-            backend("cuda", "cuda")
+            choose_backend("cuda", "cuda")
 
 
 def test_triton_that_is_too_old_is_explained(monkeypatch):

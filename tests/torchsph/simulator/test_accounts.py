@@ -6,7 +6,7 @@ import torch
 
 import geometry
 from torchsph import CompleteKernelWall, PotentialWall, Rollback, Scene, Simulator, preset
-from torchsph.simulator.rollback import Checkpoints
+from torchsph.simulator.rollback import RollbackStates
 from torchsph.simulator.scene import Fluid, Valve
 from torchsph.simulator.state.particles import Particles
 from torchsph.simulator.state.record import Record
@@ -154,14 +154,14 @@ def test_what_is_taken_back_has_not_happened():
     """A rollback puts every account of a member back to what it was at the state that it goes back to."""
     run = started(geometry.WallMotion.at_rest(square(8)), "weakly_compressible", 8)
     record = Record(2, 1)
-    checkpoints = Checkpoints(Rollback(), record)
+    states = RollbackStates(Rollback(), record)
     both = run.particles.repeated(2)
     still, done = torch.zeros_like(both.position), torch.zeros(2, dtype=torch.float64)
-    checkpoints.keep(both, still, done)
+    states.keep(both, still, done)
     names = ("inflow", "outflow", "energy_in", "energy_out", "wall_work", "source_work", "merged", "reseeded")
     for name in names:
         getattr(record, name).add_(1)
-    checkpoints.restored(torch.tensor([True, False]), both, still, done)
+    states.restored(torch.tensor([True, False]), both, still, done)
     assert all(getattr(record, name).flatten().tolist() == [0, 1] for name in names)
 
 

@@ -8,7 +8,7 @@ import torch
 from torchsph import NumericalFailure, Rollback, Scene, Simulator, WeaklyCompressible
 from torchsph.simulator.scene import Fluid
 from torchsph.simulator.state.particles import Particles
-from torchsph.simulator.stepping.terms import LIMITS
+from torchsph.simulator.state.record import LIMITS
 
 SCENE = Scene(spacing=1 / 20, fluid=Fluid(1.0, 0.01), period=(1.0, 1.0), reference_speed=1.0, dimension=2)
 BACKENDS = ["auto", "reference"]

@@ -10,7 +10,7 @@ import geometry
 from torchsph import NumericalFailure, Rollback, Scene, Simulator, WeaklyCompressible
 from torchsph.simulator.scene import Fluid
 from torchsph.simulator.state.particles import Particles
-from torchsph.simulator.stepping.terms import LIMITS
+from torchsph.simulator.state.record import LIMITS
 from torchsph.validation.exact_flows import FREE_SURFACE_OPTIONS
 
 PRECISIONS = [torch.float32, torch.float64]

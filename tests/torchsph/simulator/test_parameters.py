@@ -11,7 +11,7 @@ from scipy.special import j0
 
 from torchsph import XSPH, GammaRamp, PotentialWall, Projection, Scene, Simulator, WeaklyCompressible, preset
 from torchsph.pairs.smoothing_kernels import kernel
-from torchsph.simulator import simulation
+from torchsph.simulator import spatial_sort
 from torchsph.simulator.scene import Fluid
 from torchsph.simulator.state.particles import Particles
 
@@ -248,12 +248,12 @@ def test_sorting_in_space_leaves_the_caller_its_particles(monkeypatch):
     start = particles_at(place, torch.randn((256, 2), generator=generator, dtype=torch.float64), members=2)
     ends = []
     for least in (10**9, 0):
-        monkeypatch.setattr(simulation, "_SORT_FROM", least)
-        monkeypatch.setattr(simulation, "_SORT_EVERY", 2)
+        monkeypatch.setattr(spatial_sort, "_SORT_FROM", least)
+        monkeypatch.setattr(spatial_sort, "_SORT_EVERY", 2)
         run = Simulator(scene, preset("weakly_compressible"), dtype=torch.float64).resume(start, 0.0)
         for k in range(1, 4):
             run.advance(0.01 * k)
-        moved = run._order is not None and not torch.equal(run._order, torch.arange(512))
+        moved = run._spatial.order is not None and not torch.equal(run._spatial.order, torch.arange(512))
         assert moved == (least == 0 and run._backend.name == "cpu")
         ends.append(run.particles)
     torch.testing.assert_close(ends[0].position, ends[1].position, rtol=0, atol=1e-9)

@@ -5,9 +5,9 @@ import torch
 
 import geometry
 from torchsph import Scene, Seeding, Simulator, preset, residual_motion
-from torchsph.pairs import RateTerms, Support, backend
+from torchsph.pairs import RateTerms, Support, choose_backend
 from torchsph.pairs.smoothing_kernels import kernel
-from torchsph.simulator.schemes.weakly_compressible import PotentialWall
+from torchsph.simulator.schemes.wall_models import PotentialWall
 
 BALL = geometry.WallMotion.at_rest(geometry.ellipsoid((0.01, 0.01, 0.01), 1e-3))
 SCENE = Scene(spacing=1e-3, walls=BALL)
@@ -23,7 +23,7 @@ def test_the_quiet_start_fills_the_cavity_evenly():
     p = run.particles
     assert p.count == pytest.approx(BALL.volume(0.0) / 1e-9, rel=0.1)
     assert float(p.mass.sum()) * 1e-9 == pytest.approx(BALL.volume(0.0), rel=1e-9)
-    engine, support = backend("reference"), Support(kernel("wendland_c2"), 1.3, 3)
+    engine, support = choose_backend("reference"), Support(kernel("wendland_c2"), 1.3, 3)
     pairs = engine.search(p.position, p.member, support.radius)
     sums = engine.rates(pairs, p.state(p.deviation), support, RateTerms(continuity=None, shepard=True))
     inner = p.position.norm(dim=1) < 7.0

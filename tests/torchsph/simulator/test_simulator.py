@@ -10,7 +10,7 @@ import torch
 import geometry
 from torchsph import Scene, Simulator, WeaklyCompressible, preset
 from torchsph.simulator.scene import Fluid, Valve
-from torchsph.simulator.schemes.weakly_compressible import PotentialWall
+from torchsph.simulator.schemes.wall_models import PotentialWall
 from torchsph.simulator.state.particles import Particles
 
 PERIODIC = Scene(spacing=1 / 24, fluid=Fluid(1.0, 0.02), period=(1.0, 1.0), reference_speed=1.0, dimension=2)
@@ -81,7 +81,7 @@ def test_a_batch_of_three_equals_three_single_runs():
 
 def test_symmetric_forces_conserve_linear_and_angular_momentum():
     """Pressure 2.23 and artificial viscosity are central and pairwise: both momenta stand still at round-off."""
-    from torchsph.pairs import MomentumTerms, PairState, Support, backend
+    from torchsph.pairs import MomentumTerms, PairState, Support, choose_backend
     from torchsph.pairs.smoothing_kernels import kernel
 
     generator = torch.Generator().manual_seed(0)
@@ -91,7 +91,7 @@ def test_symmetric_forces_conserve_linear_and_angular_momentum():
     deviation = 0.05 * torch.randn(600, generator=generator, dtype=torch.float64)
     label = torch.zeros(600, dtype=torch.int64)
     state = PairState(x, v, mass, deviation, 10 * deviation, label)
-    engine, support = backend("reference"), Support(kernel("gaussian"), 0.84, 3)
+    engine, support = choose_backend("reference"), Support(kernel("gaussian"), 0.84, 3)
     pairs = engine.search(x, label, support.radius)
     force = mass[:, None] * engine.momentum(pairs, state, support, MomentumTerms("symmetric", artificial=2.0))
     size = force.abs().sum()

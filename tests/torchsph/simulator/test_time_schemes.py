@@ -8,7 +8,9 @@ import torch
 
 from torchsph import XSPH, Scene, Simulator, WeaklyCompressible
 from torchsph.simulator.scene import Fluid
+from torchsph.simulator.schemes.weakly_compressible import ORDERS
 from torchsph.simulator.state.particles import Particles
+from torchsph.simulator.stepping.time_schemes import TIME_SCHEMES
 
 STEPS = (32, 64, 128)
 
@@ -32,10 +34,10 @@ def end_state(order, steps, viscosity):
     place = torch.cartesian_prod(axis, axis)
     x, y = (2 * math.pi * place / 16).unbind(1)
     velocity = 0.5 * torch.stack([-torch.cos(x) * torch.sin(y), torch.sin(x) * torch.cos(y)], 1)
-    one, label = torch.ones_like(x), torch.zeros(256, dtype=torch.int64)
+    ones, label = torch.ones_like(x), torch.zeros(256, dtype=torch.int64)
     place = place + 0.05 * torch.stack([torch.sin(x + y), torch.cos(x - y)], 1)
     simulator = Simulator(scene, scheme, dtype=torch.float64, backend="reference")
-    run = simulator.resume(Particles(place, velocity, 0 * one, one, label, label, 1), 0.0)
+    run = simulator.resume(Particles(place, velocity, 0 * ones, ones, label, label, 1), 0.0)
     run.advance(0.05)
     assert int(run.record.steps) == steps
     return torch.cat([run.particles.position, run.particles.velocity], 1)
@@ -63,6 +65,10 @@ def test_order_of_the_steps(order, viscosity, expected):
     assert observed(order, viscosity) == pytest.approx(expected, abs=0.25)
 
 
+def test_every_order_that_a_scheme_can_name_is_stepped():
+    assert set(TIME_SCHEMES) == set(ORDERS)
+
+
 def test_options_that_would_be_ignored_are_refused():
     with pytest.raises(ValueError, match="tensile must be positive and needs pressure='symmetric'"):
         WeaklyCompressible(tensile=0.2)
@@ -74,7 +80,7 @@ def test_options_that_would_be_ignored_are_refused():
 
 def test_the_softening_of_the_viscous_term_is_compensated():
     """Over a lattice with a wide kernel the term acts on a shear wave as nu k^2 with the share divided out, 0.6 %."""
-    from torchsph.pairs import MomentumTerms, PairState, Support, backend
+    from torchsph.pairs import MomentumTerms, PairState, Support, choose_backend
     from torchsph.pairs.smoothing_kernels import kernel
     from torchsph.simulator.stepping.terms import softened_share
 
@@ -83,12 +89,12 @@ def test_the_softening_of_the_viscous_term_is_compensated():
     place[:, 1] = place[:, 1] - 8
     wave = 2 * math.pi / 96
     velocity = torch.stack([0 * place[:, 0], torch.sin(wave * place[:, 0])], 1)
-    one, label = torch.ones(len(place), dtype=torch.float64), torch.zeros(len(place), dtype=torch.int64)
+    ones, label = torch.ones(len(place), dtype=torch.float64), torch.zeros(len(place), dtype=torch.int64)
     support = Support(kernel("wendland_c2"), 2.0, 2)
-    engine = backend("reference")
+    engine = choose_backend("reference")
     period = torch.tensor([96.0, 16.0], dtype=torch.float64)
     pairs = engine.search(place, label, support.radius, period=period)
-    state = PairState(place, velocity, one, 0 * one, 0 * one, label)
+    state = PairState(place, velocity, ones, 0 * ones, 0 * ones, label)
     force = engine.momentum(pairs, state, support, MomentumTerms(None, laminar=1.0))[:, 1]
     acting = -float((force * velocity[:, 1]).sum() / velocity[:, 1].square().sum()) / wave**2
     share = softened_share(support.kernel, 2)

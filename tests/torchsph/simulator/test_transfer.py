@@ -6,9 +6,10 @@ import pytest
 import torch
 
 from geometry import Grid
-from torchsph.pairs import backend
+from torchsph.pairs import choose_backend
+from torchsph.pairs.moving_least_squares import fetch_at
 from torchsph.pairs.registry import available_backends
-from torchsph.simulator.imposing import fetch_at, impose_at, pulled, wendland_weight
+from torchsph.simulator.transfer.imposing import impose_at, pulled, wendland_weight
 
 BACKENDS = [one.name for one in available_backends() if one.present]
 SLOPE = torch.tensor([[0.3, -1.0, 0.2], [0.5, 0.1, -0.7], [1.1, 0.4, 0.9]], dtype=torch.float64)
@@ -32,7 +33,7 @@ def test_fetch_reproduces_linear_fields(name, dimension, dtype, tolerance):
     side, x = cloud(dimension, dtype)
     points = 2.0 + (side - 4.0) * torch.rand(200, dimension, dtype=dtype)
     label = torch.zeros(len(x), dtype=torch.int64)
-    found = fetch_at(backend(name), points, label[:200], x, label, linear(x), 2.0)
+    found = fetch_at(choose_backend(name), points, label[:200], x, label, linear(x), 2.0)
     assert found.covered.all()
     assert (found.value - linear(points)).abs().max() < tolerance
 
@@ -55,7 +56,7 @@ def test_impose_then_fetch_of_a_linear_field():
     carried, _ = impose_at(x, grid, field, torch.ones(grid.shape, dtype=torch.float64))
     inner = torch.cartesian_prod(*[torch.arange(3.0, 8.0, dtype=torch.float64)] * 3)
     label = torch.zeros(len(x), dtype=torch.int64)
-    found = fetch_at(backend("reference"), inner, label[: len(inner)], x, label, carried, 2.0)
+    found = fetch_at(choose_backend("reference"), inner, label[: len(inner)], x, label, carried, 2.0)
     assert found.covered.all()
     torch.testing.assert_close(found.value, linear(inner), rtol=0, atol=1e-9)
 
@@ -64,7 +65,7 @@ def test_points_without_particles_are_uncovered_and_hold_zero():
     x = torch.rand(200, 3) * 3.0
     points = torch.tensor([[1.5, 1.5, 1.5], [30.0, 30.0, 30.0]])
     label = torch.zeros(200, dtype=torch.int64)
-    found = fetch_at(backend("reference"), points, label[:2], x, label, torch.ones(200, 3), 1.0)
+    found = fetch_at(choose_backend("reference"), points, label[:2], x, label, torch.ones(200, 3), 1.0)
     assert found.covered.tolist() == [True, False]
     assert found.value[1].tolist() == [0.0, 0.0, 0.0]
 
@@ -74,7 +75,7 @@ def test_particles_of_another_member_are_not_seen():
     member = (torch.arange(400) % 2).to(torch.int64)
     value = member.to(torch.float32)[:, None].expand(-1, 3).contiguous()
     points = torch.full((2, 3), 1.5)
-    found = fetch_at(backend("reference"), points, torch.tensor([0, 1]), x, member, value, 1.5)
+    found = fetch_at(choose_backend("reference"), points, torch.tensor([0, 1]), x, member, value, 1.5)
     torch.testing.assert_close(found.value, torch.tensor([[0.0] * 3, [1.0] * 3]), atol=1e-5, rtol=0)
 
 
@@ -82,7 +83,7 @@ def test_neighbours_in_a_plane_give_their_mean_not_a_wild_slope():
     x = torch.cartesian_prod(torch.arange(5.0), torch.arange(5.0), torch.zeros(1)).double()
     label = torch.zeros(25, dtype=torch.int64)
     found = fetch_at(
-        backend("reference"), torch.tensor([[2.0, 2.0, 0.7]]).double(), label[:1], x, label, x[:, :1] + 3.0, 2.0
+        choose_backend("reference"), torch.tensor([[2.0, 2.0, 0.7]]).double(), label[:1], x, label, x[:, :1] + 3.0, 2.0
     )
     assert float(found.value) == pytest.approx(5.0, abs=1e-6)
 

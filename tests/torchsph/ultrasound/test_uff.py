@@ -6,7 +6,7 @@ import torch
 from ultrasound_cases import cube, packet
 
 from geometry import Grid
-from torchsph.ultrasound.scanner.acquisition import Beams
+from torchsph.ultrasound.acquisition import Beams
 from torchsph.ultrasound.uff import UffVolumes, read_uff, regular_grid, write_uff
 
 GRID = Grid((-1e-3, 2e-3, 20e-3), (0.5e-3, 0.4e-3, 0.3e-3), (4, 3, 5))

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from torchsph import Scene, Simulator, WeaklyCompressible, preset
-from torchsph.pairs import backend
+from torchsph.pairs import choose_backend
 from torchsph.pairs.interface import MomentumTerms, PairState, Support
 from torchsph.pairs.smoothing_kernels import kernel
 from torchsph.simulator.scene import Fluid
@@ -26,8 +26,8 @@ def rotating_patch(viscosity, dtype=torch.float64, **changes):
     position = torch.cartesian_prod(axis, axis)
     arm = (position - count / 2) * scene.spacing
     velocity = omega * torch.stack([-arm[:, 1], arm[:, 0]], 1) + torch.tensor([0.3, -0.2], dtype=dtype)
-    one, label = torch.ones_like(position[:, 0]), torch.zeros(len(position), dtype=torch.int64)
-    start = Particles(position, velocity, 0 * one, one, label, label, 1)
+    ones, label = torch.ones_like(position[:, 0]), torch.zeros(len(position), dtype=torch.int64)
+    start = Particles(position, velocity, 0 * ones, ones, label, label, 1)
     scheme = WeaklyCompressible(**(validation.FREE_SURFACE_OPTIONS | changes))
     return Simulator(scene, scheme, dtype=dtype).resume(start, 0.0)
 
@@ -83,7 +83,7 @@ def viscous_power(run):
     """Power per mass of the laminar forces between the particles, by their sums alone."""
     scene, scheme, p = run.simulator.scene, run.simulator.scheme, run.particles
     support = Support(kernel(scheme.kernel), scheme.smoothing_ratio, p.position.shape[1])
-    acting = backend("reference")
+    acting = choose_backend("reference")
     pairs = acting.search(p.position, p.member, support.radius, period=run.domain.period)
     nu = scene.fluid.kinematic_viscosity / run.units.kinematic_viscosity
     state = PairState(p.position, p.velocity, p.mass, p.deviation, torch.zeros_like(p.deviation), p.member)
@@ -118,14 +118,14 @@ def test_only_the_difference_form_is_blind_to_the_level_of_the_pressure(form):
     axis = torch.arange(12, dtype=torch.float64) + 0.5
     position = torch.cartesian_prod(axis, axis)
     position = position + 0.2 * torch.rand(position.shape, generator=generator, dtype=torch.float64)
-    one, member = torch.ones_like(position[:, 0]), torch.zeros(len(position), dtype=torch.int64)
+    ones, member = torch.ones_like(position[:, 0]), torch.zeros(len(position), dtype=torch.int64)
     support = Support(kernel("wendland_c2"), 1.3, 2)
     period = torch.full((2,), 12.0, dtype=torch.float64)
-    acting = backend("auto")
+    acting = choose_backend("auto")
     pairs = acting.search(position, member, support.radius, period=period)
     largest = {}
     for level in (-1.0, 1.0):
-        state = PairState(position, torch.zeros_like(position), one, 0 * one, level * one, member)
+        state = PairState(position, torch.zeros_like(position), ones, 0 * ones, level * ones, member)
         force = acting.momentum(pairs, state, support, MomentumTerms(pressure=form))
         largest[level] = float(force.norm(dim=1).max())
     blind = [level for level in largest if largest[level] < 1e-13]

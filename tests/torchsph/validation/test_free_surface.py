@@ -100,7 +100,7 @@ WEDGE = np.array([[0.7, 0.0], [1.0, 0.4], [1.3, 0.0]])
 
 
 def on_a_wedge(dtype, backend, wall, spacing=0.05):
-    """Figure 4.6 of the thesis: a block of 0.8 m falls on a wedge; the scene holds it with room for the splash."""
+    """Grønli 2017, fig. 4.6: a block of 0.8 m falls on a wedge; the scene holds it with room for the splash."""
     corners = np.concatenate([[[0.0, 0.0]], WEDGE, [[2.0, 0.0], [2.0, 2.5], [0.0, 2.5]]])
     surface = geometry.polygon(corners, spacing)
     scene = Scene(

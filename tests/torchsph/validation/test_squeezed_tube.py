@@ -94,8 +94,8 @@ def test_an_end_at_a_given_pressure_passes_what_the_volume_demands(name, rate, b
 def test_channels_go_with_their_opening():
     """The wall of the channel behind a narrowing opening does not close in: its velocity is the opening's own."""
     run, _ = squeezed("projection", -4.0)
-    run.domain.enter(0.001, 0.002)
+    run.surroundings.enter(0.001, 0.002)
     beyond = torch.tensor([[6.5, 0.0, 18.0], [0.0, -6.5, 20.0]])
     inside = torch.tensor([[6.5, 0.0, 8.0]])
-    assert float(run.domain.sample_at(beyond).velocity.norm(dim=1).max()) < 1e-3
-    assert float(run.domain.sample_at(inside).velocity.norm()) == pytest.approx(4.0 * RADIUS / 0.2, rel=0.05)
+    assert float(run.surroundings.sample_at(beyond).velocity.norm(dim=1).max()) < 1e-3
+    assert float(run.surroundings.sample_at(inside).velocity.norm()) == pytest.approx(4.0 * RADIUS / 0.2, rel=0.05)

@@ -12,6 +12,9 @@ from torch import Tensor
 
 from ..errors import AssimilationError
 
+# the median of chi^2 with one degree of freedom: half of all squares of standard normal numbers lie below it
+CHI2_MEDIAN = 0.454936423119572
+
 
 def crps(members: Tensor, truth: Tensor, *, fair: bool = False) -> Tensor:
     """Continuous ranked probability score `(*shape)`, in the unit of the variable; smaller is better.

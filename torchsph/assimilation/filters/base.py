@@ -64,6 +64,30 @@ class Analysis:
         """`(*batch, m)`: innovation over its expected standard deviation; about N(0, 1) if all is well."""
         return self.innovation / self.innovation_variance.sqrt()
 
+    def carried_back(self, earlier: Tensor) -> Tensor:
+        """An ensemble of an earlier time as this analysis improves it: an ensemble smoother.
+
+        The analysis is a linear map of members, and the same map improves the states that those members came from: no
+        backward pass, no model (Evensen & van Leeuwen 2000, Mon. Wea. Rev. 128, 1852; Cohn et al. 1994). Inflation is
+        not applied to earlier states; a rotation is, so that members stay matched.
+
+        Args:
+            earlier: `(*batch, N, n)` the states that the members came from.
+
+        Raises:
+            AssimilationError: the analysis has left its transform behind.
+        """
+        if self.transform is None:
+            raise AssimilationError("this analysis has left its transform behind: earlier states cannot follow it")
+        moved, reached = self.transform.apply(earlier), self.transform.reached
+        if reached is not None:
+            moved = torch.where(reached, moved, earlier)
+        if self.rotation is None:
+            return moved
+        wide = moved.double()
+        mean = wide.mean(-2, keepdim=True)
+        return (mean + self.rotation @ (wide - mean)).to(earlier.dtype)
+
 
 class Filter(Protocol):
     """Anything that turns a forecast ensemble and observations into an analysed ensemble."""
@@ -93,7 +117,8 @@ class Filter(Protocol):
 class Transform(Protocol):
     """A linear map of members; `reached`, broadcastable to `(*batch, N, n)`, marks what it may change."""
 
-    reached: Tensor | None
+    @property
+    def reached(self) -> Tensor | None: ...
 
     def apply(self, ensemble: Tensor) -> Tensor:
         """`(*batch, N, n)` -> analysed `(*batch, N, n)`, dtype kept, before inflation and rotation."""

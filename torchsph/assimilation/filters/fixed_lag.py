@@ -13,11 +13,9 @@ from .base import Analysis, Filter
 
 
 class FixedLagSmoother:
-    """Later observations applied to earlier states (Evensen & van Leeuwen 2000; Cohn et al. 1994).
+    """Later observations applied to the states of the last `lag` cycles (`Analysis.carried_back`).
 
-    Each analysis is a linear map of members, and the same map improves the states of the last `lag` cycles:
-    no backward pass, no model. Inflation is not applied to earlier states; a rotation is, so that members
-    stay matched. Feed it exactly like the filter.
+    Feed it exactly like the filter.
     """
 
     def __init__(self, filter_: Filter, lag: int) -> None:
@@ -39,7 +37,7 @@ class FixedLagSmoother:
         analysis = self.filter.analyse(
             ensemble, predicted, observations, state_positions=state_positions, generator=generator
         )
-        self._states = deque(self._smoothed(state, analysis) for state in self._states)
+        self._states = deque(analysis.carried_back(state) for state in self._states)
         self._states.append(analysis.ensemble)
         finished = self._states.popleft() if len(self._states) > self.lag else None
         return analysis, finished
@@ -56,13 +54,3 @@ class FixedLagSmoother:
 
     def restore(self, states: list[Tensor]) -> None:
         self._states = deque(state.clone() for state in states)
-
-    def _smoothed(self, state: Tensor, analysis: Analysis) -> Tensor:
-        smoothed = analysis.transform.apply(state)
-        if analysis.transform.reached is not None:
-            smoothed = torch.where(analysis.transform.reached, smoothed, state)
-        if analysis.rotation is not None:
-            wide = smoothed.double()
-            mean = wide.mean(-2, keepdim=True)
-            smoothed = (mean + analysis.rotation @ (wide - mean)).to(state.dtype)
-        return smoothed

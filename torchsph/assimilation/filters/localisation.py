@@ -120,14 +120,14 @@ class PatchGrid:
         )
         cell = torch.minimum(torch.floor(place).long().clamp(min=0), last)
         fraction = (place - cell).clamp(0, 1)
-        shape = torch.tensor(self.shape, device=points.device)
+        period = torch.tensor(self.shape, device=points.device)
         indices, weights = [], []
         for corner in itertools.product((0, 1), repeat=len(self.shape)):
             offset = torch.tensor(corner, device=points.device)
-            node = (cell + offset) % shape
+            node = (cell + offset) % period
             flat = torch.zeros(len(points), dtype=torch.long, device=points.device)
-            for axis, count in enumerate(self.shape):
-                flat = flat * count + node[:, axis]
+            for axis, nodes in enumerate(self.shape):
+                flat = flat * nodes + node[:, axis]
             indices.append(flat)
             weights.append(torch.where(offset.bool(), fraction, 1 - fraction).prod(-1))
         return torch.stack(indices, -1), torch.stack(weights, -1)

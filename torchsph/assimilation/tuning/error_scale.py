@@ -8,12 +8,10 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from ..diagnostics.scores import CHI2_MEDIAN
 from ..errors import AssimilationError
 from ..filters.base import Analysis
 from ..observations import Observations, Reason
-
-# The median of chi^2 with one degree of freedom: half of all normalised squares lie below it.
-_MEDIAN = 0.454936423119572
 
 
 class ErrorScale:
@@ -79,7 +77,7 @@ class ErrorScale:
         for _ in range(40):
             middle = 0.5 * (low + high)
             ratio = square / (predicted + math.exp(middle) * stated)
-            if ratio.median().item() > _MEDIAN:
+            if ratio.median().item() > CHI2_MEDIAN:
                 low = middle
             else:
                 high = middle

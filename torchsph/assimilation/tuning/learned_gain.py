@@ -60,7 +60,7 @@ class LearnedGain:
         """From one cycle.
 
         Args:
-            seen: `(J, m)` what was offered in the cycle before, in the place of the observations.
+            seen: `(J, m)` the increments of the cycle before, in the place of the observations.
             innovation: `(m,)` of this cycle, of the forecast that started from the weighted increments.
             weight: `(m,)` not negative, 1 / variance for instance; 0 for observations that are not used.
         """

@@ -47,7 +47,7 @@ class SpreadMatch:
         }
 
     def restore(self, state: dict[str, float]) -> None:
-        self.factor, self.now, self.cycles = state["factor"], state["now"], state["cycles"]
+        self.factor, self.now, self.cycles = state["factor"], state["now"], int(state["cycles"])
         self._taken, self._before = state["taken"], state["before"]
 
     def learn(self, shown: float, own: float) -> None:

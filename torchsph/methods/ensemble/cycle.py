@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 import geometry
+from geometry.grids.fields import fwhm_to_deviation
 from torchsph.assimilation import (
     Analysis,
     Augmentation,
@@ -24,7 +25,6 @@ from torchsph.assimilation import (
     concatenate,
     replace_failed,
 )
-from torchsph.ultrasound.estimation.box_sums import fwhm_to_deviation
 
 from ..frame_splines import FrameSmoother
 from ..measurement.observation_operator import Seen, Source

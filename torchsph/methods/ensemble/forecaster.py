@@ -16,8 +16,8 @@ import torch.distributed as dist
 from torch import Tensor
 
 import geometry
+from torchsph.simulator.failures import NumericalFailure
 from torchsph.simulator.grid_forecast import GridForecast, Transfer
-from torchsph.simulator.simulation import NumericalFailure
 from torchsph.simulator.simulator import Simulator
 
 

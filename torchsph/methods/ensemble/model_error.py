@@ -7,7 +7,7 @@ import torch
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
-from torchsph.ultrasound.estimation.box_sums import convolve_axis
+from geometry.grids.fields import convolve_axis
 
 # the potential grows from the wall over this many correlation lengths
 _WALL_LAYER = 1.5

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 import geometry
+from geometry.grids.fields import fwhm_to_deviation, masked_blur
 from torchsph.assimilation import Observations, Reason
-from torchsph.ultrasound.estimation.box_sums import fwhm_to_deviation, masked_blur
 
 from ..frame_splines import beam_at, node_weights
 from .error_model import ObservationError

@@ -28,7 +28,7 @@ typedef struct { /* cluster lists; see lists.hpp */
 
 typedef struct {
   int32_t dimension, threads;
-  uint32_t terms;             /* sum of sph::Term */
+  uint32_t terms;             /* sum of sph::Term, of terms.hpp as the other enums */
   int32_t weight, form, kernel;
   double support, sigma;
   int64_t particles, clusters;
@@ -39,8 +39,7 @@ typedef struct {
   const double* coefficients; /* (members, 4): smoothing length, artificial, laminar, tensile */
   const void *position, *velocity, *mass, *deviation, *pressure, *slope, *field;
   const uint8_t* active;
-  void *divergence, *diffusion, *concentration, *xsph, *acceleration, *shepard_volume, *shepard_mass, *renormalisation,
-      *laplacian, *diagonal, *gradient, *moment_first, *moment_second, *moment_mass;
+  void* const* outputs;       /* one for each of SPH_OUTPUTS; null: not asked for */
 } sph_pass;
 
 typedef struct { /* the pressure Poisson equation; see poisson.hpp */
@@ -157,6 +156,11 @@ typedef struct { /* points and a periodic lattice; see gridding.cpp */
   void* field;                  /* (.., y, x) complex; spread: added to */
 } sph_gridding;
 
+typedef struct { /* where a field lies in a structure, in bytes; without a name: the structure itself */
+  const char *structure, *field;
+  int64_t offset, size;
+} sph_layout;
+
 #ifdef __cplusplus
 extern "C" {
 #endif
@@ -191,6 +195,7 @@ void sph_gather_f32(const sph_gridding*);
 void sph_gather_f64(const sph_gridding*);
 void sph_grid_closest(const sph_closest*);
 int sph_runs(const char* instruction_set);             /* whether this processor has it */
+const sph_layout* sph_layouts(int64_t* count);
 double sph_fma(int threads, int64_t turns, float factor); /* float32 multiply-adds; the flop done */
 #pragma GCC visibility pop
 #ifdef __cplusplus

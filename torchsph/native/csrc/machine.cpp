@@ -1,21 +1,18 @@
-// What this processor can do: its instruction sets, and the rate at which it multiplies and adds.
+// What this processor can do: its instruction sets, and the rate at which it multiplies and adds; what this library takes.
 #include <omp.h>
 
-#include <cstring>
+#include <iterator>
 
 #include "interface.h"
 #include "lanes.hpp"
+#include "layouts.hpp"
+#include "processor.hpp"
 
-extern "C" int sph_runs(const char* instruction_set) {
-  if (!std::strcmp(instruction_set, "baseline")) return 1;
-#if defined(__x86_64__)
-  __builtin_cpu_init();
-  if (!std::strcmp(instruction_set, "avx2")) return __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma");
-  if (!std::strcmp(instruction_set, "avx512"))
-    return __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("avx512vl") &&
-           __builtin_cpu_supports("avx512bw");
-#endif
-  return 0;
+extern "C" int sph_runs(const char* instruction_set) { return processor_runs(instruction_set); }
+
+extern "C" const sph_layout* sph_layouts(int64_t* count) {
+  *count = std::size(layouts);
+  return layouts;
 }
 
 // Chains of x <- x a + b in registers; the caller takes the time. Returns the additions and multiplications done.

@@ -1,6 +1,7 @@
 // Plain C interface to the search and the pair sums; compiled once for each precision (SPH_REAL) and instruction set.
 #include "interface.h"
 
+#include <iterator>
 #include <utility>
 
 #include "interpolation.hpp"
@@ -29,18 +30,19 @@ Shape shape_of(const sph_search& s) {
   return {s.particles, s.member, s.radius, {s.period[0], s.period[1], s.period[2]}, s.threads};
 }
 
-// The combinations that are compiled: every subset of the rates, every subset of the accelerations, and (float on wide
-// registers) the two together, where a scheme evaluates them at one state. Elsewhere the caller makes two passes.
-// The incompressible scheme asks for the filling of the kernels as well, with and without friction.
-constexpr std::uint32_t filling = continuity | shepard, filling_shifted = filling | concentration;
+constexpr bool special(std::uint32_t t) {
+  for (const std::uint32_t pass : special_passes)
+    if (pass == t) return true;
+  return false;
+}
 
+// The combinations that are compiled: every subset of the rates, every subset of the accelerations, (float on wide
+// registers) the two together, where a scheme evaluates them at one state, and the special passes.
 constexpr bool compiled(std::uint32_t t) {
-  const std::uint32_t rates = t & (continuity | diffusion | concentration | xsph);
-  const std::uint32_t forces = t & (pressure | artificial | laminar | tensile);
-  if (t > 255) return t == shepard || t == renormalisation || t == laplacian || t == gradient || t == (gradient | renormalisation) ||
-           t == corrected_diffusion || t == moments || t == filling || t == filling_shifted || t == (filling_shifted | laminar);
+  const bool rates = t & rate_terms, accelerations = t & acceleration_terms;
+  if (t & ~(rate_terms | acceleration_terms)) return special(t);
   if ((t & tensile) && !(t & pressure)) return false;
-  if (!rates || !forces) return t != 0;
+  if (!rates || !accelerations) return t != 0;
   return sizeof(Real) == 4 && register_bytes > 16 && (t & continuity) && (t & pressure) && !(t & (concentration | tensile));
 }
 
@@ -51,22 +53,21 @@ template <int D, std::uint32_t T> constexpr Run run_of() {
   else return nullptr;
 }
 
-template <int D, std::size_t... T> Run find(std::uint32_t terms, std::index_sequence<T...>) {
+template <int D, std::size_t... T> Run find_combination(std::uint32_t terms, std::index_sequence<T...>) {
   static constexpr Run table[] = {run_of<D, T>()...};
-  if (terms < sizeof...(T)) return table[terms];
-  switch (terms) {
-    case shepard: return run_of<D, shepard>();
-    case renormalisation: return run_of<D, renormalisation>();
-    case laplacian: return run_of<D, laplacian>();
-    case gradient: return run_of<D, gradient>();
-    case gradient | renormalisation: return run_of<D, gradient | renormalisation>();
-    case corrected_diffusion: return run_of<D, corrected_diffusion>();
-    case moments: return run_of<D, moments>();
-    case filling: return run_of<D, filling>();
-    case filling_shifted: return run_of<D, filling_shifted>();
-    case filling_shifted | laminar: return run_of<D, filling_shifted | laminar>();
-    default: return nullptr;
-  }
+  return table[terms];
+}
+
+template <int D, std::size_t... I> Run find_special(std::uint32_t terms, std::index_sequence<I...>) {
+  Run found = nullptr;
+  ((void)(special_passes[I] == terms ? found = run_of<D, special_passes[I]>() : nullptr), ...);
+  return found;
+}
+
+template <int D> Run find(std::uint32_t terms) {
+  constexpr std::size_t combinations = (rate_terms | acceleration_terms) + 1;
+  if (terms < combinations) return find_combination<D>(terms, std::make_index_sequence<combinations>());
+  return find_special<D>(terms, std::make_index_sequence<std::size(special_passes)>());
 }
 
 const Real* reals(const void* a) { return static_cast<const Real*>(a); }
@@ -82,17 +83,12 @@ State<Real> state_of(const sph_pass& p) {
 }
 
 template <int D> int pass(const sph_pass& p) {
-  const Run run = find<D>(p.terms, std::make_index_sequence<256>());
+  const Run run = find<D>(p.terms);
   if (!run) return SPH_NOT_COMPILED;
-  const auto out = [](void* a) { return static_cast<Real*>(a); };
   const Lists<Real> lists = lists_of(p);
-  const Outputs<Real> outputs{out(p.divergence), out(p.diffusion), out(p.concentration), out(p.xsph), out(p.acceleration),
-                              out(p.shepard_volume), out(p.shepard_mass), out(p.renormalisation), out(p.laplacian),
-                              out(p.diagonal), out(p.gradient), out(p.moment_first), out(p.moment_second),
-                              out(p.moment_mass)};
   const KernelChoice kernel{p.kernel, p.support, p.sigma};
   pack<Real, D>(layout(D, p.terms), state_of(p), lists, rows);
-  run(lists, rows, kernel, reinterpret_cast<const Coefficients*>(p.coefficients), outputs);
+  run(lists, rows, kernel, reinterpret_cast<const Coefficients*>(p.coefficients), Outputs<Real>(p.outputs));
   return SPH_DONE;
 }
 

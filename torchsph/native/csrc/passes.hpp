@@ -5,11 +5,18 @@
 
 namespace sph {
 
-constexpr double singularity = 0.01;  // keeps 1 / r^2 finite, in squared smoothing lengths (epsilon of thesis 2.28)
+constexpr double singularity = 0.01;  // keeps 1 / r^2 finite, in squared smoothing lengths (epsilon of Grønli 2017, eq. 2.28)
 
 template <class Real> struct Outputs {  // arrays in the caller's order; null where a sum was not asked for
-  Real *divergence, *diffusion, *concentration, *xsph, *acceleration, *shepard_volume, *shepard_mass, *renormalisation,
-      *laplacian, *diagonal, *gradient, *moment_first, *moment_second, *moment_mass;
+#define SPH_POINTER(name, ...) Real* name = nullptr;
+  SPH_OUTPUTS(SPH_POINTER)
+#undef SPH_POINTER
+  Outputs() = default;
+  explicit Outputs(void* const* given) {
+#define SPH_TAKE(name, ...) name = static_cast<Real*>(*given++);
+    SPH_OUTPUTS(SPH_TAKE)
+#undef SPH_TAKE
+  }
 };
 
 struct Coefficients {  // of one member
@@ -45,10 +52,13 @@ template <class Real, int D, std::uint32_t T> struct Pass {
     std::int32_t kernel;
   };
 
+  template <int rank, int count = components(rank, D)> struct Sum { using Type = V[count]; };
+  template <int count> struct Sum<0, count> { using Type = V; };
+
   struct Sums {
-    V divergence{}, diffusion{}, shepard_volume{}, shepard_mass{}, laplacian{}, diagonal{};
-    V concentration[D] = {}, xsph[D] = {}, acceleration[D] = {}, renormalisation[D * D] = {}, gradient[D] = {};
-    V moment_first[D] = {}, moment_second[D * D] = {}, moment_mass[D] = {};
+#define SPH_SUM(name, terms, rank, ...) typename Sum<rank>::Type name = {};
+    SPH_OUTPUTS(SPH_SUM)
+#undef SPH_SUM
   };
 
   struct Own {  // the particles a
@@ -173,32 +183,21 @@ template <class Real, int D, std::uint32_t T> struct Pass {
     }
   }
 
+  template <int rank>
+  static SPH_INLINE void put_all(const typename Sum<rank>::Type& sum, Real scale, const Real* factor,
+                                 const std::int32_t* slot, Real* out) {
+    if constexpr (rank == 0) put<Real>(sum, scale, factor, slot, out, 1);
+    else
+      for (int k = 0; k < components(rank, D); ++k) put<Real>(sum[k], scale, factor, slot, out + k, components(rank, D));
+  }
+
   static SPH_INLINE void write(const Sums& s, const std::int32_t* slot, const Real* factor, Real per_value, Real per_slope,
                                const Outputs<Real>& o) {
-    if constexpr (has(continuity)) put<Real>(s.divergence, per_slope, nullptr, slot, o.divergence, 1);
-    if constexpr (has(diffusion | corrected_diffusion)) put<Real>(s.diffusion, 2 * per_slope, nullptr, slot, o.diffusion, 1);
-    if constexpr (has(shepard)) {
-      put<Real>(s.shepard_volume, per_value, nullptr, slot, o.shepard_volume, 1);
-      put<Real>(s.shepard_mass, per_value, nullptr, slot, o.shepard_mass, 1);
-    }
-    if constexpr (has(laplacian)) {
-      put<Real>(s.laplacian, 2 * per_slope, factor, slot, o.laplacian, 1);
-      if (o.diagonal) put<Real>(s.diagonal, 2 * per_slope, factor, slot, o.diagonal, 1);
-    }
-    for (int d = 0; d < D; ++d) {
-      if constexpr (has(gradient)) put<Real>(s.gradient[d], per_slope, nullptr, slot, o.gradient + d, D);
-      if constexpr (has(moments)) {
-        put<Real>(s.moment_first[d], per_value, nullptr, slot, o.moment_first + d, D);
-        put<Real>(s.moment_mass[d], per_value, nullptr, slot, o.moment_mass + d, D);
-      }
-      if constexpr (has(concentration)) put<Real>(s.concentration[d], per_slope, nullptr, slot, o.concentration + d, D);
-      if constexpr (has(xsph)) put<Real>(s.xsph[d], 2 * per_value, factor, slot, o.xsph + d, D);
-      if constexpr (has(pressure | artificial | laminar)) put<Real>(s.acceleration[d], per_slope, factor, slot, o.acceleration + d, D);
-    }
-    if constexpr (has(moments))
-      for (int d = 0; d < D * D; ++d) put<Real>(s.moment_second[d], per_value, nullptr, slot, o.moment_second + d, D * D);
-    if constexpr (has(renormalisation))
-      for (int d = 0; d < D * D; ++d) put<Real>(s.renormalisation[d], per_slope, nullptr, slot, o.renormalisation + d, D * D);
+#define SPH_WRITE(name, terms, rank, power, times, own) \
+  if constexpr (has(terms))                             \
+    if (o.name) put_all<rank>(s.name, times * (power ? per_slope : per_value), own ? factor : nullptr, slot, o.name);
+    SPH_OUTPUTS(SPH_WRITE)
+#undef SPH_WRITE
   }
 
   static void run(const Lists<Real>& lists, const Rows<Real>& rows, const KernelChoice& choice, const Coefficients* members,

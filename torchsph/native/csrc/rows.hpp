@@ -6,23 +6,19 @@
 // In both, w_b factor_a / (k_a + k_b) = m_b / (rho_a + rho_b), and w_b factor_a (1/k_a + 1/k_b) is Morris's weight.
 #pragma once
 #include "columns.hpp"
+#include "terms.hpp"
 
 namespace sph {
 
-enum Term : std::uint32_t {
-  continuity = 1, diffusion = 2, concentration = 4, xsph = 8,
-  pressure = 16, artificial = 32, laminar = 64, tensile = 128,
-  shepard = 256, renormalisation = 512, laplacian = 1024,
-  gradient = 2048, corrected_diffusion = 4096, moments = 8192
-};
+// How many numbers a scalar, vector or matrix has.
+constexpr int components(int rank, int dimension) { return rank == 0 ? 1 : dimension * components(rank - 1, dimension); }
 
-enum Weight : std::int32_t { by_volume = 0, by_mass = 1 };
-enum PressureForm : std::int32_t { symmetric = 0, sum = 1, switched = 2, difference = 3 };
-
-// Where each field stands in a row; -1: not there.
+// Where each field stands in a row, after the place and the weight; -1: not there.
 struct Layout {
-  int dimension = 0, velocity = -1, weight = -1, stress = -1, inertia = -1, inverse = -1, deviation = -1, mass = -1,
-      field = -1, slope = -1, fields = 0;
+  int dimension = 0, weight = -1, fields = 0;
+#define SPH_PLACE(name, rank, readers) int name = -1;
+  SPH_FIELDS(SPH_PLACE)
+#undef SPH_PLACE
   constexpr int stride() const { return (fields + 7) / 8 * 8; }
   constexpr int factor() const { return fields; }  // only the particles a have it
   constexpr int block() const { return (fields + 1) * cluster_size; }
@@ -31,17 +27,15 @@ struct Layout {
 constexpr Layout layout(int dimension, std::uint32_t terms) {
   Layout l;
   l.dimension = dimension;
-  int next = dimension;
-  if (terms & (continuity | xsph | artificial | laminar)) { l.velocity = next; next += dimension; }
-  l.weight = next++;
-  if (terms & pressure) l.stress = next++;
-  if (terms & (xsph | artificial | laminar)) l.inertia = next++;
-  if (terms & laminar) l.inverse = next++;
-  if (terms & (diffusion | gradient | corrected_diffusion)) l.deviation = next++;
-  if (terms & (shepard | moments)) l.mass = next++;
-  if (terms & laplacian) l.field = next++;
-  if (terms & corrected_diffusion) { l.slope = next; next += dimension; }
-  l.fields = next;
+  l.weight = dimension;
+  l.fields = dimension + 1;
+#define SPH_PLACE(name, rank, readers)         \
+  if (terms & (readers)) {                     \
+    l.name = l.fields;                         \
+    l.fields += components(rank, dimension);   \
+  }
+  SPH_FIELDS(SPH_PLACE)
+#undef SPH_PLACE
   return l;
 }
 

@@ -1,12 +1,9 @@
-// The smoothing kernels of torchsph/smoothing.py in closed form: W = sigma / h^D w(q),  dW/dr / r = sigma / h^(D+2) s(q).
+// The smoothing kernels of pairs/smoothing_kernels.py in closed form: W = sigma / h^D w(q),  dW/dr / r = sigma / h^(D+2) s(q).
 #pragma once
 #include "lanes.hpp"
+#include "terms.hpp"
 
 namespace sph {
-
-enum Kernel : std::int32_t {
-  wendland_c2 = 0, wendland_c4 = 1, wendland_c6 = 2, cubic = 3, quintic = 4, gaussian = 5, spiky = 6, kernels = 7
-};
 
 template <class V> struct Smoothing {
   V value;  // w(q)
@@ -47,10 +44,11 @@ SPH_INLINE Smoothing<V> smoothing(std::int32_t kernel, V square /* q^2 */, Real 
       const V inner = -120 + q * q * (120 - 50 * q), outer = -5 * (a4 - 6 * b4) / larger(q, zero + Real(0.5));
       return {a4 * a - 6 * b4 * b + 15 * c2 * c2 * c, q < 1 ? inner : outer};
     }
-    default: {  // spiky: the slope does not vanish at r = 0, where its direction is undefined anyway
+    case spiky: {  // the slope does not vanish at r = 0, where its direction is undefined anyway
       const V t = positive_part(1 - q), t2 = t * t;
       return {t2 * t, -3 * t2 / larger(q, zero + Real(1e-6))};
     }
+    default: return {zero, zero};  // there is no other number
   }
 }
 

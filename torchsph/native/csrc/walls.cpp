@@ -6,10 +6,9 @@
 #include <cstdint>
 
 #include "interface.h"
+#include "terms.hpp"
 
 namespace {
-
-enum Form { symmetric = 0, sum = 1, switched = 2, difference = 3 };
 
 // One particle's row: distance, normal, velocity of the wall, share of the kernel, its gradient, perhaps what is swept.
 template <class Real, int D>
@@ -50,7 +49,7 @@ void rates(const sph_walls& a) {
 
 template <class Real>
 Real opposite(Real pressure, int form) {  // what the wall carries against a particle's own pressure
-  return form == switched ? std::fabs(pressure) : form == difference ? -pressure : pressure;
+  return form == sph::switched ? std::fabs(pressure) : form == sph::difference ? -pressure : pressure;
 }
 
 template <class Real, int D>

@@ -9,13 +9,13 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchsph.native.library import library
+from torchsph.native.library import LibraryMissing, library
 
 from ..interface import Moments, PairState, Support, check_search
 from ..poisson import PoissonSolution
 from . import cpu_operators as operators
 from . import plan
-from .planned import PlannedBackend, lengths
+from .planned import PlannedBackend, lengths, slope_of
 
 # buffers of lists that nobody holds any more; a few, so that memory is given back
 _SPARE: deque[Tensor] = deque(maxlen=4)
@@ -57,7 +57,7 @@ class ClusterPairs:
         return sum(tensor.numel() * tensor.element_size() for tensor in self.lists) - spare
 
 
-class CpuBackend(PlannedBackend):
+class CpuBackend(PlannedBackend[ClusterPairs]):
     """Compiled pair sums, float32 or float64, on as many threads as torch uses; not differentiable.
 
     A particle's result does not depend on the number of threads, nor on which other members are in the batch.
@@ -128,8 +128,8 @@ class CpuBackend(PlannedBackend):
             numbers,
             plan.coefficients(support, request.momentum, pairs.members),
             *(t.contiguous() for t in (state.position, state.velocity, state.mass, state.deviation)),
-            state.pressure.contiguous() if request.terms & plan.PRESSURE else None,
-            state.slope.contiguous() if request.terms & plan.CORRECTED_DIFFUSION else None,
+            state.pressure.contiguous() if request.terms & plan.STRESSED else None,
+            slope_of(state).contiguous() if request.terms & plan.SLOPED else None,
             None if field is None else field.contiguous(),
             None if active is None else active.contiguous(),
         )
@@ -159,9 +159,15 @@ class CpuBackend(PlannedBackend):
             kind,
             numbers,
             plan.coefficients(support, None, pairs.members),
-            *(t.contiguous() for t in (state.position, state.mass, state.deviation, group, source)),
+            state.position.contiguous(),
+            state.mass.contiguous(),
+            state.deviation.contiguous(),
+            group.contiguous(),
+            source.contiguous(),
             None if start is None else start.contiguous(),
-            *(t.contiguous() for t in (free, active, singular)),
+            free.contiguous(),
+            active.contiguous(),
+            singular.contiguous(),
             tolerance,
             iterations,
         )
@@ -196,3 +202,14 @@ class CpuBackend(PlannedBackend):
                 None if weight is None else weight.contiguous(),
             )
         )
+
+
+def status(device: str) -> tuple[bool, str]:
+    """Whether the backend can be used on ``device``, and why (not)."""
+    if torch.device(device).type != "cpu":
+        return False, f"works on CPU tensors only, the device asked for is '{device}'"
+    try:
+        compiled = library()
+    except LibraryMissing as problem:
+        return False, str(problem)
+    return True, f"compiled C++ on {compiled.instruction_set} instructions"

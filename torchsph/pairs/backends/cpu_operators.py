@@ -8,23 +8,23 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Callable, Sequence
+from functools import lru_cache
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from torchsph.native.library import (
-    REALS,
+from torchsph.native.library import REALS, address, library
+from torchsph.native.structures import (
     InterpolationArguments,
     ListArguments,
     PassArguments,
     PoissonArguments,
     SearchArguments,
     Sizes,
-    address,
-    library,
 )
 
+from ..terms import OUTPUTS, outputs_of
 from . import plan
 
 CLUSTER = 8
@@ -146,22 +146,30 @@ def pair_pass(
 
     Args:
         lists: slot, owner, entries, offset, home of ``cluster_lists``. period: (D,), inf where not periodic.
-        choice: terms, weight, pressure form and kernel of csrc/rows.hpp and csrc/smoothing.hpp.
+        choice: terms, weight, pressure form and kernel by the numbers of ``pairs.terms`` and ``smoothing_kernels``.
         kernel: support in smoothing lengths and sigma_D. coefficients: (members, 4) float64.
 
     Returns:
-        One tensor per name in ``plan.Pass(terms, weight).outputs``.
+        One tensor for each of ``outputs_of(terms)``.
     """
-    terms, weight = choice[:2]
+    terms = choice[0]
     outputs = plan.allocate(terms, position)
     given = _pass_arguments(
         lists, period, choice, kernel, coefficients, position, velocity, mass, deviation, pressure, slope, field, active
     )
-    for name, output in zip(plan.Pass(terms, weight).outputs, outputs, strict=True):
-        setattr(given, name, output.data_ptr())
+    addresses = (ctypes.c_void_p * len(OUTPUTS))()
+    for place, output in zip(_places(terms), outputs, strict=True):
+        addresses[place] = output.data_ptr()
+    given.outputs = ctypes.addressof(addresses)
     if library().function("pass", REALS[position.dtype])(ctypes.byref(given)):
         raise NotImplementedError(f"no compiled pass has exactly the terms {terms:#x}")
     return outputs
+
+
+@lru_cache
+def _places(terms: int) -> tuple[int, ...]:
+    """Where in ``OUTPUTS`` the sums of a pass stand."""
+    return tuple(OUTPUTS.index(output) for output in outputs_of(terms))
 
 
 def _pass_arguments(
@@ -242,7 +250,7 @@ def poisson(
     count = torch.empty(groups, dtype=torch.int64)
     residual, mismatch = (torch.empty(groups, dtype=torch.float64) for _ in range(2))
     arguments = PoissonArguments(
-        pass_=given,
+        **{"pass": given},
         source=source.data_ptr(),
         start=address(start),
         free=free.data_ptr(),

@@ -6,42 +6,34 @@ w = m / rho with the pressure sum divided by rho_a afterwards, or by mass, w = m
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import torch
 from torch import Tensor
 
-from ..interface import PRESSURE_FORMS, MomentumTerms, RateTerms, Support
-from ..smoothing_kernels import KERNELS
-
-# sph::Term of csrc/rows.hpp
-CONTINUITY, DIFFUSION, CONCENTRATION, XSPH = 1, 2, 4, 8
-PRESSURE, ARTIFICIAL, LAMINAR, TENSILE = 16, 32, 64, 128
-SHEPARD, RENORMALISATION, LAPLACIAN = 256, 512, 1024
-GRADIENT, CORRECTED_DIFFUSION, MOMENTS = 2048, 4096, 8192
-BY_VOLUME, BY_MASS = 0, 1
-# the order of sph::Kernel in csrc/smoothing.hpp
-KERNEL_ORDER = ("wendland_c2", "wendland_c4", "wendland_c6", "cubic", "quintic", "gaussian", "spiky")
-
-_SCALAR, _VECTOR, _MATRIX = 0, 1, 2
-# the sums that each term fills, with the rank of their trailing shape
-_OUTPUTS: tuple[tuple[int, str, int], ...] = (
-    (CONTINUITY, "divergence", _SCALAR),
-    (DIFFUSION, "diffusion", _SCALAR),
-    (CONCENTRATION, "concentration", _VECTOR),
-    (XSPH, "xsph", _VECTOR),
-    (PRESSURE | ARTIFICIAL | LAMINAR, "acceleration", _VECTOR),
-    (SHEPARD, "shepard_volume", _SCALAR),
-    (SHEPARD, "shepard_mass", _SCALAR),
-    (RENORMALISATION, "renormalisation", _MATRIX),
-    (LAPLACIAN, "laplacian", _SCALAR),
-    (LAPLACIAN, "diagonal", _SCALAR),
-    (GRADIENT, "gradient", _VECTOR),
-    (CORRECTED_DIFFUSION, "diffusion", _SCALAR),
-    (MOMENTS, "moment_first", _VECTOR),
-    (MOMENTS, "moment_second", _MATRIX),
-    (MOMENTS, "moment_mass", _VECTOR),
+from ..interface import MomentumTerms, RateTerms, Support
+from ..smoothing_kernels import KERNELS, NUMBERS
+from ..terms import (
+    BY_MASS,
+    BY_VOLUME,
+    COMPANIES,
+    PRESSURE_FORMS,
+    RATE,
+    SINGLE,
+    TERMS,
+    flags,
+    outputs_of,
+    reading,
 )
+
+(CONTINUITY, DIFFUSION, CONCENTRATION, XSPH, PRESSURE, ARTIFICIAL, LAMINAR, TENSILE) = (
+    flags(name)
+    for name in ("continuity", "diffusion", "concentration", "xsph", "pressure", "artificial", "laminar", "tensile")
+)
+SHEPARD, LAPLACIAN = flags("shepard"), flags("laplacian")
+STRESSED, SLOPED = reading("stress"), reading("slope")
 
 # what an incompressible step asks for at once; loops over these rates take Shepard's sums along
 _WITH_SHEPARD = (CONTINUITY, CONTINUITY | CONCENTRATION)
@@ -66,44 +58,50 @@ class Pass:
     @property
     def outputs(self) -> list[str]:
         """Names of the sums, in the order in which a pass returns them."""
-        return [name for flag, name, _ in _OUTPUTS if self.terms & flag]
+        return [output.name for output in outputs_of(self.terms)]
 
 
 def allocate(terms: int, position: Tensor) -> list[Tensor]:
     """Uninitialised results of a pass with these terms, (N,), (N, D) or (N, D, D)."""
     count, dimension = position.shape
-    return [position.new_empty((count, *(dimension,) * rank)) for flag, _, rank in _OUTPUTS if terms & flag]
+    return [position.new_empty((count, *(dimension,) * output.rank)) for output in outputs_of(terms)]
 
 
-def rate_passes(terms: RateTerms) -> list[Pass]:
+@lru_cache
+def rate_passes(terms: RateTerms) -> tuple[Pass, ...]:
     """The passes that give the first-pass sums."""
-    flags = DIFFUSION * terms.diffusion | CONCENTRATION * terms.concentration | XSPH * terms.xsph
-    passes = []
+    asked = flags(*_asked(terms, RATE))
+    passes: list[Pass] = []
     if terms.continuity == "volume":
-        flags |= CONTINUITY
+        asked |= CONTINUITY
     elif terms.continuity == "mass":
-        if flags & (DIFFUSION | CONCENTRATION):  # these are weighted by volume
+        if asked & (DIFFUSION | CONCENTRATION):  # these are weighted by volume
             passes.append(Pass(CONTINUITY, BY_MASS))
         else:
-            passes, flags = [Pass(CONTINUITY | flags, BY_MASS)], 0
-    if terms.shepard and flags in _WITH_SHEPARD:
-        flags, terms = flags | SHEPARD, replace(terms, shepard=False)
-    return passes + ([Pass(flags, BY_VOLUME)] if flags else []) + _separate_passes(terms)
+            passes, asked = [Pass(CONTINUITY | asked, BY_MASS)], 0
+    if terms.shepard and asked in _WITH_SHEPARD:
+        asked, terms = asked | SHEPARD, replace(terms, shepard=False)
+    return (*passes, *([Pass(asked, BY_VOLUME)] if asked else []), *_single_passes(terms))
+
+
+def _asked(terms: RateTerms, kind: str) -> list[str]:
+    """Names of the terms of a kind that a request switches on; the continuity has forms in place of a switch."""
+    return [term.name for term in TERMS if term.kind == kind and getattr(terms, term.name, None) is True]
 
 
 def force_pass(terms: MomentumTerms) -> Pass | None:
     """The pass that gives the acceleration; None where there is no force."""
-    flags = (
+    asked = (
         PRESSURE * (terms.pressure is not None)
         | ARTIFICIAL * (terms.artificial is not None)
         | LAMINAR * (terms.laminar is not None)
         | TENSILE * (terms.tensile is not None)
     )
     weight = BY_MASS if terms.pressure in (None, "symmetric") else BY_VOLUME
-    return Pass(flags, weight, terms) if flags else None
+    return Pass(asked, weight, terms) if asked else None
 
 
-def shared_passes(rates: RateTerms, momentum: MomentumTerms) -> list[Pass] | None:
+def shared_passes(rates: RateTerms, momentum: MomentumTerms) -> Sequence[Pass] | None:
     """Passes that sum rates and forces in one loop; None for a combination that is not compiled so."""
     force = force_pass(momentum)
     if force is not None and force.terms == LAMINAR and [p.terms for p in rate_passes(rates)] == [_FILLING]:
@@ -114,25 +112,22 @@ def shared_passes(rates: RateTerms, momentum: MomentumTerms) -> list[Pass] | Non
         return None
     if rates.diffusion and force.weight == BY_MASS:
         return None
-    flags = force.terms | CONTINUITY | DIFFUSION * rates.diffusion | XSPH * rates.xsph
-    return [Pass(flags, force.weight, momentum), *_separate_passes(rates)]
+    asked = force.terms | CONTINUITY | DIFFUSION * rates.diffusion | XSPH * rates.xsph
+    return [Pass(asked, force.weight, momentum), *_single_passes(rates)]
 
 
-def _separate_passes(terms: RateTerms) -> list[Pass]:
-    wanted = (
-        (terms.shepard, SHEPARD),
-        (terms.renormalisation and not terms.gradient, RENORMALISATION),
-        (terms.gradient and not terms.renormalisation, GRADIENT),
-        (terms.gradient and terms.renormalisation, GRADIENT | RENORMALISATION),
-        (terms.corrected_diffusion, CORRECTED_DIFFUSION),
-        (terms.moments, MOMENTS),
-    )
-    return [Pass(flag, BY_VOLUME) for asked, flag in wanted if asked]
+def _single_passes(terms: RateTerms) -> list[Pass]:
+    names = _asked(terms, SINGLE)
+    together = [company for company in COMPANIES if set(company) <= set(names)]
+    alone = [name for name in names if not any(name in company for company in together)]
+    return [Pass(flags(*company), BY_VOLUME) for company in (*((name,) for name in alone), *together)]
 
 
 def coefficients(support: Support, momentum: MomentumTerms | None, members: int) -> Tensor:
     """(members, 4) float64: smoothing length, artificial and laminar viscosity, tensile coefficient."""
-    artificial, laminar, tensile = 0.0, 0.0, 0.0
+    artificial: float | Tensor = 0.0
+    laminar: float | Tensor = 0.0
+    tensile: float | Tensor = 0.0
     if momentum is not None:
         artificial = 0.0 if momentum.artificial is None else momentum.artificial
         laminar = 0.0 if momentum.laminar is None else momentum.laminar
@@ -156,19 +151,19 @@ def _shape_at(support: Support, distance: float) -> Tensor:
 
 
 def kernel_choice(support: Support, backend: str) -> tuple[int, list[float]]:
-    """Index in ``KERNEL_ORDER``, and support in smoothing lengths with sigma_D, of a compiled-in kernel.
+    """Number of a compiled-in kernel, and its support in smoothing lengths with sigma_D.
 
     Raises:
-        ValueError: the kernel is not one of ``torchsph.smoothing``.
+        ValueError: the kernel is neither one of ``smoothing_kernels.KERNELS`` nor a truncated Gaussian.
     """
     if support.per_particle:
         raise ValueError(f"the {backend} backend has one smoothing length per member; use backend='reference'")
     kernel = support.kernel
     family = "gaussian" if kernel.name.startswith("gaussian") else kernel.name
     known = family == "gaussian" or KERNELS.get(kernel.name) is kernel
-    if family not in KERNEL_ORDER or not known:
+    if not known:
         raise ValueError(
             f"the {backend} backend has no kernel '{kernel.name}' compiled in; use backend='reference', or "
-            f"one of {', '.join(KERNEL_ORDER)}"
+            f"one of {', '.join(KERNELS)}"
         )
-    return KERNEL_ORDER.index(family), [kernel.support, kernel.normalisation[support.dimension]]
+    return NUMBERS[family], [kernel.support, kernel.normalisation[support.dimension]]

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from typing import Any
+from collections.abc import Sequence
+from typing import Protocol, TypeVar
 
 import torch
 from torch import Tensor
@@ -12,7 +13,19 @@ from ..interface import Backend, MomentumTerms, PairState, Rates, RateTerms, Sup
 from . import plan
 
 
-class PlannedBackend(Backend):
+class Counted(Protocol):
+    """Pairs that know of how many particles they are."""
+
+    @property
+    def count(self) -> int:
+        """Number of particles of the search."""
+        ...
+
+
+Planned = TypeVar("Planned", bound=Counted)
+
+
+class PlannedBackend(Backend[Planned]):
     """A backend that evaluates one ``plan.Pass`` at a time; not differentiable."""
 
     device: str
@@ -20,30 +33,39 @@ class PlannedBackend(Backend):
     @abstractmethod
     def _evaluate(
         self,
-        pairs: Any,
+        pairs: Planned,
         state: PairState,
         support: Support,
         request: plan.Pass,
         field: Tensor | None = None,
         active: Tensor | None = None,
     ) -> list[Tensor]:
-        """The sums of one pass, in the order of ``request.outputs``."""
+        """The sums of one pass, in the order of ``request.outputs``.
+
+        Args:
+            pairs: of ``search``.
+            state: the particles.
+            support: kernel and smoothing length.
+            request: terms, weight and coefficients.
+            field: (N,), of which the Laplacian is taken.
+            active: (N,) bool, the particles that take part in it; None: all.
+        """
 
     def _shares_loops(self, dtype: torch.dtype) -> bool:
         """Whether the combinations of ``plan.shared_passes`` are compiled for this precision."""
         return True
 
-    def rates(self, pairs: Any, state: PairState, support: Support, terms: RateTerms) -> Rates:
+    def rates(self, pairs: Planned, state: PairState, support: Support, terms: RateTerms) -> Rates:
         return Rates(**self._sums(pairs, state, support, plan.rate_passes(terms)))
 
-    def momentum(self, pairs: Any, state: PairState, support: Support, terms: MomentumTerms) -> Tensor:
+    def momentum(self, pairs: Planned, state: PairState, support: Support, terms: MomentumTerms) -> Tensor:
         request = plan.force_pass(terms)
         if request is None:
             return torch.zeros_like(state.position)
         return self._sums(pairs, state, support, [request])["acceleration"]
 
     def right_hand_side(
-        self, pairs: Any, state: PairState, support: Support, rates: RateTerms, momentum: MomentumTerms
+        self, pairs: Planned, state: PairState, support: Support, rates: RateTerms, momentum: MomentumTerms
     ) -> tuple[Rates, Tensor]:
         shared = plan.shared_passes(rates, momentum) if self._shares_loops(state.position.dtype) else None
         if shared is None:
@@ -53,7 +75,7 @@ class PlannedBackend(Backend):
         return Rates(**sums), acceleration
 
     def laplacian(
-        self, pairs: Any, state: PairState, support: Support, field: Tensor, active: Tensor | None = None
+        self, pairs: Planned, state: PairState, support: Support, field: Tensor, active: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
         self.check(state.position, field)
         self._check_state(pairs, state)
@@ -61,21 +83,21 @@ class PlannedBackend(Backend):
         total, diagonal = self._evaluate(pairs, state, support, request, field, active)
         return total, diagonal
 
-    def _sums(self, pairs: Any, state: PairState, support: Support, requests: list[plan.Pass]) -> dict[str, Tensor]:
+    def _sums(
+        self, pairs: Planned, state: PairState, support: Support, requests: Sequence[plan.Pass]
+    ) -> dict[str, Tensor]:
         self._check_state(pairs, state)
         sums: dict[str, Tensor] = {}
         for request in requests:
-            if request.terms & plan.PRESSURE:
+            if request.terms & plan.STRESSED:
                 self.check(state.position, state.pressure)
-            if request.terms & plan.CORRECTED_DIFFUSION:
-                if state.slope is None:
-                    raise ValueError("corrected_diffusion needs the state's slope (PairState.slope)")
-                self.check(state.position, state.slope)
+            if request.terms & plan.SLOPED:
+                self.check(state.position, slope_of(state))
             outputs = self._evaluate(pairs, state, support, request)
             sums.update(zip(request.outputs, outputs, strict=True))
         return sums
 
-    def _check_state(self, pairs: Any, state: PairState) -> None:
+    def _check_state(self, pairs: Planned, state: PairState) -> None:
         self.check(state.position, state.velocity, state.mass, state.deviation)
         if state.position.shape[0] != pairs.count:
             raise ValueError(
@@ -99,6 +121,13 @@ class PlannedBackend(Backend):
                 raise ValueError(
                     f"the {self.name} backend is not differentiable; use backend='reference' for gradients"
                 )
+
+
+def slope_of(state: PairState) -> Tensor:
+    """The state's slope (N, D); ValueError where it has none."""
+    if state.slope is None:
+        raise ValueError("corrected_diffusion needs the state's slope (PairState.slope)")
+    return state.slope
 
 
 def lengths(period: Tensor | None, dimension: int) -> list[float]:

@@ -8,19 +8,10 @@ import torch
 from torch import Tensor
 
 from ..cell_search import cross_pairs, half_pairs, nearest_image
-from ..interface import (
-    Backend,
-    Moments,
-    MomentumTerms,
-    PairState,
-    Rates,
-    RateTerms,
-    Support,
-    check_search,
-    per_particle,
-)
+from ..interface import Backend, Moments, MomentumTerms, PairState, Rates, RateTerms, Support, check_search
+from ..vectors import per_particle
 
-# keeps 1 / r^2 finite for coinciding particles, in squared smoothing lengths (epsilon of 2.28)
+# keeps 1 / r^2 finite for coinciding particles, in squared smoothing lengths (epsilon of Grønli 2017, eq. 2.28)
 SINGULARITY = 0.01
 TENSILE_POWER = 4
 
@@ -39,7 +30,7 @@ class PairList:
         return nearest_image(gap, self.period)
 
 
-class ReferenceBackend(Backend):
+class ReferenceBackend(Backend[PairList]):
     """Eager torch on a list that holds each pair once; both of its sides are added from the same numbers."""
 
     name = "reference"
@@ -141,8 +132,9 @@ class ReferenceBackend(Backend):
         check_search(torch.cat((position, query)), support.radius, period)
         row, particle = cross_pairs(query, query_member, position, member, support.radius, period)
         offset = nearest_image(position.index_select(0, particle) - query.index_select(0, row), period)
+        length: float | Tensor
         if support.per_particle:
-            length = support.length.index_select(0, particle)
+            length = torch.as_tensor(support.length).index_select(0, particle)
         else:
             length = per_particle(support.length, query_member.index_select(0, row))
         share = support.kernel.value(offset.norm(dim=1), length, support.dimension)
@@ -223,9 +215,12 @@ class _Geometry:
         self.square = (self.gap * self.gap).sum(1)
         # the square root has no derivative at zero; the shift is far below the rounding of any real distance
         self.distance = torch.sqrt(self.square + torch.finfo(self.square.dtype).tiny)
+        self._length: float | Tensor
+        self.length: float | Tensor
         if support.per_particle:
-            self._length = support.length
-            self.length = 0.5 * sum(self.ends(support.length))
+            self._length = torch.as_tensor(support.length)
+            first, second = self.ends(self._length)
+            self.length = 0.5 * (first + second)
         else:
             self._length = per_particle(support.length, state.member)
             self.length = self.first_of(self._length)
@@ -266,3 +261,9 @@ class _Geometry:
         """Add the contributions of each pair to both of its particles; (P, ...) twice -> (N, ...)."""
         total = to_first.new_zeros((self.count, *to_first.shape[1:]))
         return total.index_add(0, self.first, to_first).index_add(0, self.second, to_second)
+
+
+def status(device: str) -> tuple[bool, str]:
+    """Whether the backend can be used on ``device``, and why."""
+    del device  # torch serves every one
+    return True, "plain torch, any device, always present"

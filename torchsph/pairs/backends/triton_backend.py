@@ -20,6 +20,7 @@ from torch import Tensor
 
 from ..cell_search import _cells, _key, _shifted
 from ..interface import Moments, PairState, Support, check_search
+from ..terms import BY_VOLUME, FIELDS, SLOPE, VALUE, outputs_of, reading
 from . import plan
 from .planned import PlannedBackend, lengths
 from .reference import SINGULARITY, ReferenceBackend
@@ -78,15 +79,15 @@ def cell_runs(position: Tensor, member: Tensor, radius: float, period: Tensor | 
     return CellRuns(order, own.to(torch.int32), start, stop, lengths_of_axes, int(own[-1]) + 1)
 
 
-class CudaBackend(PlannedBackend):
+class CudaBackend(PlannedBackend[CellRuns]):
     """Pair sums in Triton, float32 or float64; not differentiable."""
 
     name = "cuda"
 
     def __init__(self) -> None:
-        from .triton_kernels import pair_sums  # triton comes with torch's CUDA builds only
+        from . import triton_kernels  # triton comes with torch's CUDA builds only
 
-        self._kernel = pair_sums
+        self._kernels = triton_kernels
         interpreted = os.environ.get("TRITON_INTERPRET") == "1"
         self.device = "cpu" if interpreted else "cuda"
         # the interpreter's time goes with the number of programs, whatever their width
@@ -135,17 +136,15 @@ class CudaBackend(PlannedBackend):
         outputs = plan.allocate(request.terms, state.position)
         if pairs.count == 0:
             return outputs
-        packed, rows = _pack(pairs, state, request, field, active)
+        terms = request.terms
+        packed, factor = self._pack(pairs, state, request, field, active)
         table = plan.coefficients(support, request.momentum, pairs.members)
-        own_stress = _own_stress(packed, rows, request)
         width = sum(output[0].numel() for output in outputs)
         raw = packed.new_empty((width, pairs.count))
-        terms = {name: bool(request.terms & getattr(plan, name)) for name in _TERMS}
-        jumps = plan.CONTINUITY | plan.XSPH | plan.ARTIFICIAL | plan.LAMINAR
         periods = packed.new_tensor([*pairs.period, float("inf")][:3])
-        self._kernel[(triton_blocks(pairs.count, self._block),)](
+        self._kernels.pair_sums[(triton_blocks(pairs.count, self._block),)](
             packed,
-            own_stress,
+            self._own_stress(packed, request, state.position.shape[1]),
             raw,
             _kernel_coefficients(table).to(packed),
             pairs.member,
@@ -159,12 +158,32 @@ class CudaBackend(PlannedBackend):
             RANGES=pairs.start.shape[0],
             PERIODIC=any(length != float("inf") for length in pairs.period),
             BLOCK=self._block,
-            JUMPS=bool(request.terms & jumps),
-            APPROACH=bool(request.terms & (plan.CONTINUITY | plan.ARTIFICIAL)),
-            **terms,
-            **{name: rows.get(name, 0) for name in _ROWS},
+            TERMS=terms,
         )
-        return _scaled(raw, outputs, pairs, request, table[:, 0], sigma, packed, rows)
+        _scale(raw, outputs, pairs, terms, table[:, 0], sigma, factor)
+        return outputs
+
+    def _pack(
+        self, pairs: CellRuns, state: PairState, request: plan.Pass, field: Tensor | None, active: Tensor | None
+    ) -> tuple[Tensor, Tensor]:
+        """(F, N) fields in cell order, of which those that no term reads hold nothing, and the factor (N,) of a."""
+        quantities = {"position": state.position.T, "weight": _weight(state, request, active)[None]}
+        for name in FIELDS:
+            if request.terms & reading(name):
+                quantities[name] = _field(name, state, request, field)
+        rows = self._kernels.rows_of(state.position.shape[1])
+        packed = state.position.new_empty((max(row.stop for row in rows.values()), pairs.count))
+        for name, values in quantities.items():
+            packed[rows[name]] = values[:, pairs.order]
+        return packed, _factor(state, request, active)[pairs.order]
+
+    def _own_stress(self, packed: Tensor, request: plan.Pass, dimension: int) -> Tensor:
+        """The pressure with which a particle a enters its own sum: |p| or -p in two of the forms."""
+        if request.momentum is None or request.momentum.pressure is None:
+            return packed
+        stress = packed[self._kernels.rows_of(dimension)["stress"]]
+        form = request.momentum.pressure
+        return stress.abs() if form == "switched" else -stress if form == "difference" else stress
 
 
 def triton_blocks(count: int, block: int) -> int:
@@ -173,62 +192,36 @@ def triton_blocks(count: int, block: int) -> int:
 
 
 _OLDEST_TRITON = (3, 3)  # the first whose kernels may hold tuples
-_TERMS = (
-    "CONTINUITY",
-    "DIFFUSION",
-    "CONCENTRATION",
-    "XSPH",
-    "PRESSURE",
-    "ARTIFICIAL",
-    "LAMINAR",
-    "TENSILE",
-    "SHEPARD",
-    "RENORMALISATION",
-    "LAPLACIAN",
-    "GRADIENT",
-    "CORRECTED_DIFFUSION",
-    "MOMENTS",
-)
-_ROWS = ("WEIGHT", "STRESS", "INERTIA", "INVERSE", "DEVIATION", "MASS", "FIELD", "SLOPE")
 
 
-def _pack(
-    pairs: CellRuns, state: PairState, request: plan.Pass, field: Tensor | None, active: Tensor | None
-) -> tuple[Tensor, dict[str, int]]:
-    """(F, N) fields in cell order, and the row of each: position, velocity, ..., the factor of a."""
+def _weight(state: PairState, request: plan.Pass, active: Tensor | None) -> Tensor:
+    """w_b of the pass, 0 on inactive particles."""
+    weight = state.volume if request.weight == BY_VOLUME else state.mass
+    return weight if active is None else weight * active
+
+
+def _factor(state: PairState, request: plan.Pass, active: Tensor | None) -> Tensor:
+    """What a particle's own sums are multiplied by; see csrc/rows.hpp."""
     density = 1.0 + state.deviation
-    by_volume = request.weight == plan.BY_VOLUME
-    weight = state.mass / density if by_volume else state.mass
-    if active is not None:
-        weight = weight * active
-    symmetric = request.momentum is not None and request.momentum.pressure == "symmetric"
-    quantities: dict[str, Tensor] = {"WEIGHT": weight}
-    if request.terms & plan.PRESSURE:
-        quantities["STRESS"] = state.pressure / density**2 if symmetric else state.pressure
-    quantities["INERTIA"] = 1.0 / density if by_volume else density
-    quantities["INVERSE"] = density if by_volume else 1.0 / density
-    quantities["DEVIATION"] = state.deviation
-    if request.terms & (plan.SHEPARD | plan.MOMENTS):
-        quantities["MASS"] = state.mass
-    if field is not None:
-        quantities["FIELD"] = field
-    if request.terms & plan.CORRECTED_DIFFUSION:
-        quantities |= {name: part for name, part in zip(("SLOPE", "SLOPE_Y", "SLOPE_Z"), state.slope.T, strict=False)}
-    quantities["FACTOR"] = 1.0 / density if by_volume else torch.ones_like(density)
-    if field is not None:
-        quantities["FACTOR"] = torch.ones_like(density) if active is None else active.to(density.dtype)
-    vectors = [*state.position.T, *state.velocity.T]
-    packed = torch.stack([*vectors, *quantities.values()])[:, pairs.order].contiguous()
-    return packed, {name: len(vectors) + row for row, name in enumerate(quantities)}
+    if request.terms & reading("field"):
+        return torch.ones_like(density) if active is None else active.to(density.dtype)
+    return 1.0 / density if request.weight == BY_VOLUME else torch.ones_like(density)
 
 
-def _own_stress(packed: Tensor, rows: dict[str, int], request: plan.Pass) -> Tensor:
-    """The pressure with which a particle a enters its own sum: |p| or -p in two of the forms."""
-    if not request.terms & plan.PRESSURE:
-        return packed
-    stress = packed[rows["STRESS"]]
-    form = request.momentum.pressure
-    return stress.abs() if form == "switched" else -stress if form == "difference" else stress
+def _field(name: str, state: PairState, request: plan.Pass, field: Tensor | None) -> Tensor:
+    """One of ``FIELDS``, (1, N) or (D, N)."""
+    density, by_volume = 1.0 + state.deviation, request.weight == BY_VOLUME
+    if name == "stress":
+        symmetric = request.momentum is not None and request.momentum.pressure == "symmetric"
+        return (state.pressure / density**2 if symmetric else state.pressure)[None]
+    if name == "inertia":
+        return (1.0 / density if by_volume else density)[None]
+    if name == "inverse":
+        return (density if by_volume else 1.0 / density)[None]
+    if name == "field" and field is not None:
+        return field[None]
+    values: Tensor = getattr(state, name)
+    return values.T if values.ndim == 2 else values[None]
 
 
 def _kernel_coefficients(table: Tensor) -> Tensor:
@@ -237,40 +230,19 @@ def _kernel_coefficients(table: Tensor) -> Tensor:
     return torch.stack(columns, 1).contiguous()
 
 
-def _scaled(
-    raw: Tensor,
-    outputs: list[Tensor],
-    pairs: CellRuns,
-    request: plan.Pass,
-    length: Tensor,
-    sigma: float,
-    packed: Tensor,
-    rows: dict[str, int],
-) -> list[Tensor]:
-    """Sums with their prefactors, in the caller's order of particles."""
-    dimension = len(pairs.period)
+def _scale(
+    raw: Tensor, outputs: list[Tensor], pairs: CellRuns, terms: int, length: Tensor, sigma: float, factor: Tensor
+) -> None:
+    """Write sums with their prefactors into ``outputs``, in the caller's order of particles."""
+    dimension, row = len(pairs.period), 0
     member = pairs.member.to(torch.int64)
-    value, slope = ((sigma / length ** (dimension + power)).to(raw)[member] for power in (0, 2))
-    factor = packed[rows["FACTOR"]]
-    scales = {
-        "diffusion": 2.0 * slope,
-        "xsph": 2.0 * value * factor,
-        "acceleration": slope * factor,
-        "shepard_volume": value,
-        "shepard_mass": value,
-        "moment_first": value,
-        "moment_second": value,
-        "moment_mass": value,
-        "laplacian": 2.0 * slope * factor,
-        "diagonal": 2.0 * slope * factor,
-    }
-    row = 0
-    for name, output in zip(request.outputs, outputs, strict=True):
+    scale = {power: (sigma / length ** (dimension + power)).to(raw)[member] for power in (VALUE, SLOPE)}
+    for given, output in zip(outputs_of(terms), outputs, strict=True):
         width = output[0].numel()
-        part = raw[row : row + width] * scales.get(name, slope)
+        own = given.times * scale[given.power]
+        part = raw[row : row + width] * (own * factor if given.own else own)
         output[pairs.order] = part.T.reshape(output.shape)
         row += width
-    return outputs
 
 
 def status(device: str) -> tuple[bool, str]:

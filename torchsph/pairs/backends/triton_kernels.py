@@ -3,53 +3,64 @@
 A program works on a block of particles a that follow each other in cell order, so that its lanes read nearly
 the same partners b.  A lane walks the runs of particles b in the rows of cells around it.  The formulas are
 those of csrc/passes.hpp, with the same weights (see ``plan``).
+
+Fields stand in rows of an array (3 D + 1 + scalars, count): position, velocity, slope, the weight of a partner,
+the scalars of ``terms.FIELDS``. Rows that no term of a pass reads hold nothing and are not read. Sums are tuples
+of one register for each of ``terms.OUTPUTS``; those that a pass does not fill never change, and the compiler
+drops them from its loops.
 """
 
+# mypy: allow-untyped-defs, allow-incomplete-defs
+# (the language of Triton has no types)
 from __future__ import annotations
 
 import triton
 import triton.language as tl
 
+from ..terms import FIELDS, SCALAR, flags, reading
+from .triton_smoothing import smoothing_kernel
 
-@triton.jit
-def kernel_shape(square, support, KERNEL: tl.constexpr):
-    """w(q) and w'(q)/q for q^2 = ``square``; kernels in the order of ``plan.KERNEL_ORDER``."""
-    if KERNEL == 5:
-        value = tl.where(square < support * support, tl.exp(-0.5 * square), 0.0 * square)
-        slope = -value
-    else:
-        q = tl.minimum(tl.sqrt(square), support)
-        if KERNEL <= 2:
-            t = tl.maximum(1.0 - 0.5 * q, 0.0 * q)
-            t2 = t * t
-            if KERNEL == 0:
-                value = t2 * t2 * (1.0 + 2.0 * q)
-                slope = -5.0 * t2 * t
-            elif KERNEL == 1:
-                value = t2 * t2 * t2 * (1.0 + q * (3.0 + 2.9166666666666665 * q))
-                slope = -t2 * t2 * t * (4.666666666666667 + 11.666666666666666 * q)
-            else:
-                value = t2 * t2 * t2 * t2 * (1.0 + q * (4.0 + q * (6.25 + 4.0 * q)))
-                slope = -t2 * t2 * t2 * t * (5.5 + q * (19.25 + 22.0 * q))
-        elif KERNEL == 3:
-            a = tl.maximum(2.0 - q, 0.0 * q)
-            b = tl.maximum(1.0 - q, 0.0 * q)
-            value = 0.25 * a * a * a - b * b * b
-            slope = tl.where(q < 1.0, 2.25 * q - 3.0, -0.75 * a * a / tl.maximum(q, 0.5))
-        elif KERNEL == 4:
-            a = tl.maximum(3.0 - q, 0.0 * q)
-            b = tl.maximum(2.0 - q, 0.0 * q)
-            c = tl.maximum(1.0 - q, 0.0 * q)
-            a4 = a * a * a * a
-            b4 = b * b * b * b
-            value = a4 * a - 6.0 * b4 * b + 15.0 * c * c * c * c * c
-            outer = -5.0 * (a4 - 6.0 * b4) / tl.maximum(q, 0.5)
-            slope = tl.where(q < 1.0, -120.0 + q * q * (120.0 - 50.0 * q), outer)
-        else:
-            t = tl.maximum(1.0 - q, 0.0 * q)
-            value = t * t * t
-            slope = -3.0 * t * t / tl.maximum(q, 1e-6)
-    return value, slope
+CONTINUITY = tl.constexpr(flags("continuity"))
+DIFFUSION = tl.constexpr(flags("diffusion"))
+CONCENTRATION = tl.constexpr(flags("concentration"))
+XSPH = tl.constexpr(flags("xsph"))
+PRESSURE = tl.constexpr(flags("pressure"))
+ARTIFICIAL = tl.constexpr(flags("artificial"))
+LAMINAR = tl.constexpr(flags("laminar"))
+TENSILE = tl.constexpr(flags("tensile"))
+SHEPARD = tl.constexpr(flags("shepard"))
+RENORMALISATION = tl.constexpr(flags("renormalisation"))
+LAPLACIAN = tl.constexpr(flags("laplacian"))
+GRADIENT = tl.constexpr(flags("gradient"))
+CORRECTED_DIFFUSION = tl.constexpr(flags("corrected_diffusion"))
+MOMENTS = tl.constexpr(flags("moments"))
+
+# the scalars of ``FIELDS`` in their order, which is that of their rows
+SCALARS = tuple(name for name, rank in FIELDS.items() if rank == SCALAR)
+STRESS = tl.constexpr(SCALARS.index("stress"))
+INERTIA = tl.constexpr(SCALARS.index("inertia"))
+INVERSE = tl.constexpr(SCALARS.index("inverse"))
+DEVIATION = tl.constexpr(SCALARS.index("deviation"))
+MASS = tl.constexpr(SCALARS.index("mass"))
+FIELD = tl.constexpr(SCALARS.index("field"))
+# the terms that read each field
+VELOCITY_READERS = tl.constexpr(reading("velocity"))
+SLOPE_READERS = tl.constexpr(reading("slope"))
+STRESS_READERS = tl.constexpr(reading("stress"))
+INERTIA_READERS = tl.constexpr(reading("inertia"))
+INVERSE_READERS = tl.constexpr(reading("inverse"))
+DEVIATION_READERS = tl.constexpr(reading("deviation"))
+MASS_READERS = tl.constexpr(reading("mass"))
+FIELD_READERS = tl.constexpr(reading("field"))
+
+
+def rows_of(dimension: int) -> dict[str, slice]:
+    """Where each field stands in the array of a kernel."""
+    vectors = {
+        name: slice(k * dimension, (k + 1) * dimension) for k, name in enumerate(("position", "velocity", "slope"))
+    }
+    scalars = {name: slice(3 * dimension + k, 3 * dimension + k + 1) for k, name in enumerate(("weight", *SCALARS))}
+    return vectors | scalars
 
 
 @triton.jit
@@ -134,15 +145,6 @@ def store_matrix(out, row, count, a, live, matrix, D: tl.constexpr):
 
 
 @triton.jit
-def load_row(fields, row, count, at, mask, other, WANTED: tl.constexpr):
-    """A row of ``fields`` at particles, or ``other`` where no term wants it (and nothing is read)."""
-    value = other + 0.0 * at
-    if WANTED:
-        value = tl.load(fields + row * count + at, mask=mask, other=other)
-    return value
-
-
-@triton.jit
 def separation(place, other, period, PERIODIC: tl.constexpr, D: tl.constexpr):
     """Gap x_a - x_b of the nearest images, and its square."""
     x = nearest(place[0] - other[0], period[0], PERIODIC)
@@ -156,27 +158,151 @@ def separation(place, other, period, PERIODIC: tl.constexpr, D: tl.constexpr):
 
 
 @triton.jit
-def central_push(
-    stress,
-    other,
-    value,
-    approach,
-    viscosity,
-    distance,
-    PRESSURE: tl.constexpr,
-    ARTIFICIAL: tl.constexpr,
-    TENSILE: tl.constexpr,
-    tensile,
+def load_scalar(fields, count, at, mask, other, SCALAR: tl.constexpr, D: tl.constexpr, WANTED: tl.constexpr):
+    """One of the scalars at particles, or ``other`` where no term wants it (and nothing is read)."""
+    value = other + 0.0 * at
+    if WANTED:
+        value = tl.load(fields + (3 * D + 1 + SCALAR) * count + at, mask=mask, other=other)
+    return value
+
+
+@triton.jit
+def particle_fields(fields, count, at, mask, place, D: tl.constexpr, TERMS: tl.constexpr):
+    """What the terms read of particles, neutral where there is none: no 1 / (k_a + k_b) may be infinite."""
+    zero = 0.0 * place[0]
+    velocity = (zero, zero, zero)
+    slope = (zero, zero, zero)
+    if VELOCITY_READERS & TERMS:
+        velocity = load_vector(fields, D, count, at, mask, D)
+    if SLOPE_READERS & TERMS:
+        slope = load_vector(fields, 2 * D, count, at, mask, D)
+    inertia = load_scalar(fields, count, at, mask, 1.0, INERTIA, D, INERTIA_READERS & TERMS)
+    inverse = load_scalar(fields, count, at, mask, 1.0, INVERSE, D, INVERSE_READERS & TERMS)
+    deviation = load_scalar(fields, count, at, mask, 0.0, DEVIATION, D, DEVIATION_READERS & TERMS)
+    field = load_scalar(fields, count, at, mask, 0.0, FIELD, D, FIELD_READERS & TERMS)
+    return velocity, slope, inertia, inverse, deviation, field
+
+
+@triton.jit
+def add_rates(sums, gap, jump, value, slope, weight, inertia, TERMS: tl.constexpr):
+    """Continuity, concentration and XSPH of a pair, and what makes gradients exact."""
+    divergence, concentration, xsph, renormalisation = sums
+    if CONTINUITY & TERMS:
+        divergence -= slope * dot(jump, gap)
+    if CONCENTRATION & TERMS:
+        concentration = vector_sum(concentration, slope, gap)
+    if XSPH & TERMS:
+        xsph = vector_sum(xsph, -weight * value / inertia, jump)
+    if RENORMALISATION & TERMS:
+        renormalisation = matrix_sum(renormalisation, -slope, gap)
+    return divergence, concentration, xsph, renormalisation
+
+
+@triton.jit
+def add_differences(sums, gap, slope, rise, slope_sum, TERMS: tl.constexpr):
+    """Terms of the difference of the two densities."""
+    diffusion, gradient = sums
+    if DIFFUSION & TERMS:
+        diffusion -= slope * rise
+    if CORRECTED_DIFFUSION & TERMS:
+        diffusion -= slope * (rise + 0.5 * dot(gap, slope_sum))
+    if GRADIENT & TERMS:
+        gradient = vector_sum(gradient, slope * rise, gap)
+    return diffusion, gradient
+
+
+@triton.jit
+def add_fillings(sums, gap, value, weight, mass, TERMS: tl.constexpr):
+    """How particles fill the kernel: Shepard's sums and the moments."""
+    shepard_volume, shepard_mass, moment_first, moment_second, moment_mass = sums
+    if SHEPARD & TERMS:
+        shepard_volume += weight * value
+        shepard_mass += mass * value
+    if MOMENTS & TERMS:
+        moment_first = vector_sum(moment_first, -weight * value, gap)
+        moment_mass = vector_sum(moment_mass, -mass * value, gap)
+        moment_second = matrix_sum(moment_second, weight * value, gap)
+    return shepard_volume, shepard_mass, moment_first, moment_second, moment_mass
+
+
+@triton.jit
+def add_forces(
+    acceleration, gap, jump, square, distance, value, slope, stress, other, inertia, inverse, own, TERMS: tl.constexpr
 ):
-    """Pressure and artificial viscosity of a pair along its gap, before the kernel's slope."""
-    push = 0.0 * value
-    if PRESSURE:
-        push = stress + other
-        if TENSILE:
-            push += tensile * value * value * value * value * (tl.abs(stress) + tl.abs(other))
-    if ARTIFICIAL:
-        push -= viscosity * tl.minimum(approach, 0.0 * value) / distance
-    return push
+    """Pressure and viscosities of a pair; ``own``: artificial, laminar and tensile coefficient of a."""
+    if (PRESSURE | ARTIFICIAL) & TERMS:
+        push = 0.0 * value
+        if PRESSURE & TERMS:
+            push = stress + other
+            if TENSILE & TERMS:
+                push += own[2] * value * value * value * value * (tl.abs(stress) + tl.abs(other))
+        if ARTIFICIAL & TERMS:
+            push -= own[0] * tl.minimum(dot(jump, gap), 0.0 * value) / (inertia * distance)
+        acceleration = vector_sum(acceleration, -push * slope, gap)
+    if LAMINAR & TERMS:
+        acceleration = vector_sum(acceleration, own[1] * slope * square / distance * inverse, jump)
+    return acceleration
+
+
+@triton.jit
+def add_laplacian(sums, square, distance, slope, drop, TERMS: tl.constexpr):
+    """The Laplacian of a field and its diagonal."""
+    laplacian, diagonal = sums
+    if LAPLACIAN & TERMS:
+        part = slope * square / distance
+        diagonal -= part
+        laplacian -= part * drop
+    return laplacian, diagonal
+
+
+@triton.jit
+def store_sums(
+    out, count, a, live, rates, differences, fillings, acceleration, images, D: tl.constexpr, TERMS: tl.constexpr
+):
+    """Write the sums that the terms fill, in the order of ``terms.OUTPUTS``."""
+    divergence, concentration, xsph, renormalisation = rates
+    diffusion, gradient = differences
+    shepard_volume, shepard_mass, moment_first, moment_second, moment_mass = fillings
+    row = 0
+    if CONTINUITY & TERMS:
+        row = store_scalar(out, row, count, a, live, divergence)
+    if (DIFFUSION | CORRECTED_DIFFUSION) & TERMS:
+        row = store_scalar(out, row, count, a, live, diffusion)
+    if CONCENTRATION & TERMS:
+        row = store_vector(out, row, count, a, live, concentration, D)
+    if XSPH & TERMS:
+        row = store_vector(out, row, count, a, live, xsph, D)
+    if (PRESSURE | ARTIFICIAL | LAMINAR) & TERMS:
+        row = store_vector(out, row, count, a, live, acceleration, D)
+    if SHEPARD & TERMS:
+        row = store_scalar(out, row, count, a, live, shepard_volume)
+        row = store_scalar(out, row, count, a, live, shepard_mass)
+    if RENORMALISATION & TERMS:
+        row = store_matrix(out, row, count, a, live, renormalisation, D)
+    if LAPLACIAN & TERMS:
+        row = store_scalar(out, row, count, a, live, images[0])
+        row = store_scalar(out, row, count, a, live, images[1])
+    if GRADIENT & TERMS:
+        row = store_vector(out, row, count, a, live, gradient, D)
+    if MOMENTS & TERMS:
+        row = store_vector(out, row, count, a, live, moment_first, D)
+        row = store_matrix(out, row, count, a, live, moment_second, D)
+        row = store_vector(out, row, count, a, live, moment_mass, D)
+
+
+@triton.jit
+def member_coefficients(coefficients, member, a, live):
+    """1/h, 0.01 h^2, and the artificial, laminar and tensile coefficients of the particles a."""
+    own = coefficients + 5 * tl.load(member + a, mask=live, other=0)
+    return tl.load(own), tl.load(own + 1), (tl.load(own + 2), tl.load(own + 3), tl.load(own + 4))
+
+
+@triton.jit
+def no_sums(zero):
+    """Registers before the first pair, in the groups of the functions that add to them."""
+    vector = (zero, zero, zero)
+    matrix = (zero, zero, zero, zero, zero, zero)
+    return (zero, vector, vector, matrix), (zero, vector), (zero, zero, vector, matrix, vector), vector, (zero, zero)
 
 
 @triton.jit
@@ -196,65 +322,25 @@ def pair_sums(
     RANGES: tl.constexpr,
     PERIODIC: tl.constexpr,
     BLOCK: tl.constexpr,
-    JUMPS: tl.constexpr,
-    APPROACH: tl.constexpr,
-    CONTINUITY: tl.constexpr,
-    DIFFUSION: tl.constexpr,
-    CONCENTRATION: tl.constexpr,
-    XSPH: tl.constexpr,
-    PRESSURE: tl.constexpr,
-    ARTIFICIAL: tl.constexpr,
-    LAMINAR: tl.constexpr,
-    TENSILE: tl.constexpr,
-    SHEPARD: tl.constexpr,
-    RENORMALISATION: tl.constexpr,
-    LAPLACIAN: tl.constexpr,
-    GRADIENT: tl.constexpr,
-    CORRECTED_DIFFUSION: tl.constexpr,
-    MOMENTS: tl.constexpr,
-    SLOPE: tl.constexpr,
-    WEIGHT: tl.constexpr,
-    STRESS: tl.constexpr,
-    INERTIA: tl.constexpr,
-    INVERSE: tl.constexpr,
-    DEVIATION: tl.constexpr,
-    MASS: tl.constexpr,
-    FIELD: tl.constexpr,
+    TERMS: tl.constexpr,
 ):
     """Sums of BLOCK particles; ``fields`` (F, count) and ``out`` (O, count) hold one quantity per row.
 
-    WEIGHT ... FIELD are rows of ``fields`` (position first, then velocity); ``coefficients`` has five numbers
-    per member: 1/h, 0.01 h^2, 2 h times the artificial viscosity, laminar viscosity, tensile coefficient.
+    ``coefficients`` has five numbers per member: 1/h, 0.01 h^2, 2 h times the artificial viscosity, laminar viscosity,
+    tensile coefficient.
     """
-    RISES: tl.constexpr = (DIFFUSION or CORRECTED_DIFFUSION) or GRADIENT
-    INERT: tl.constexpr = XSPH or ARTIFICIAL
-    MASSES: tl.constexpr = SHEPARD or MOMENTS
     a = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     live = a < count
-    own = coefficients + 5 * tl.load(member + a, mask=live, other=0)
-    inverse_length, epsilon = tl.load(own), tl.load(own + 1)
-    artificial, laminar, tensile = tl.load(own + 2), tl.load(own + 3), tl.load(own + 4)
+    inverse_length, epsilon, viscosities = member_coefficients(coefficients, member, a, live)
     # by address: a scalar argument would be rounded to float32
     period = (tl.load(periods), tl.load(periods + 1), tl.load(periods + 2))
     place = load_vector(fields, 0, count, a, live, D)
+    velocity, own_slope, inertia, inverse, deviation, field = particle_fields(fields, count, a, live, place, D, TERMS)
     zero = 0.0 * place[0]
-    none = (zero, zero, zero)
-    velocity, own_slope = none, none
-    if JUMPS:
-        velocity = load_vector(fields, D, count, a, live, D)
-    if CORRECTED_DIFFUSION:
-        own_slope = load_vector(fields, SLOPE, count, a, live, D)
     stress = zero
-    if PRESSURE:
+    if STRESS_READERS & TERMS:
         stress = tl.load(own_stress + a, mask=live, other=0.0)
-    inertia = load_row(fields, INERTIA, count, a, live, 1.0, INERT)
-    inverse = load_row(fields, INVERSE, count, a, live, 1.0, LAMINAR)
-    deviation = load_row(fields, DEVIATION, count, a, live, 0.0, RISES)
-    field = load_row(fields, FIELD, count, a, live, 0.0, LAPLACIAN)
-
-    divergence, spread, shepard_volume, shepard_mass, total, diagonal = zero, zero, zero, zero, zero, zero
-    first, mass_first, drift, force = none, none, none, none
-    second = (zero, zero, zero, zero, zero, zero)
+    rates, differences, fillings, acceleration, images = no_sums(zero)
     for r in range(RANGES):
         begin = tl.load(start + r * count + a, mask=live, other=0)
         last = tl.load(stop + r * count + a, mask=live, other=0)
@@ -262,87 +348,20 @@ def pair_sums(
             b = begin + step
             here = b < last
             gap, square = separation(place, load_vector(fields, 0, count, b, here, D), period, PERIODIC, D)
-            value, slope = kernel_shape(square * inverse_length * inverse_length, support, KERNEL)
-            weight = tl.load(fields + WEIGHT * count + b, mask=here, other=0.0)
+            value, slope = smoothing_kernel(square * inverse_length * inverse_length, support, KERNEL)
+            weight = tl.load(fields + 3 * D * count + b, mask=here, other=0.0)
             slope = slope * weight
             distance = square + epsilon
-            pair_inertia = inertia + load_row(fields, INERTIA, count, b, here, 1.0, INERT)
-            rise = load_row(fields, DEVIATION, count, b, here, 0.0, RISES) - deviation
-            mass = load_row(fields, MASS, count, b, here, 0.0, MASSES) * value
-            jump, approach = none, zero
-            if JUMPS:
-                jump = vector_sum(velocity, -1.0, load_vector(fields, D, count, b, here, D))
-            if APPROACH:
-                approach = dot(jump, gap)
-            if CONTINUITY:
-                divergence -= slope * approach
-            if DIFFUSION:
-                spread -= slope * rise
-            if CORRECTED_DIFFUSION:
-                both = vector_sum(own_slope, 1.0, load_vector(fields, SLOPE, count, b, here, D))
-                spread -= slope * (rise + 0.5 * dot(gap, both))
-            if GRADIENT:
-                drift = vector_sum(drift, slope * rise, gap)
-            if MOMENTS:
-                first = vector_sum(first, -weight * value, gap)
-                mass_first = vector_sum(mass_first, -mass, gap)
-                second = matrix_sum(second, weight * value, gap)
-            if CONCENTRATION:
-                first = vector_sum(first, slope, gap)
-            if SHEPARD:
-                shepard_volume += weight * value
-                shepard_mass += mass
-            if RENORMALISATION:
-                second = matrix_sum(second, -slope, gap)
-            if XSPH:
-                drift = vector_sum(drift, -weight * value / pair_inertia, jump)
-            if PRESSURE or ARTIFICIAL:
-                other = load_row(fields, STRESS, count, b, here, 0.0, PRESSURE)
-                push = central_push(
-                    stress,
-                    other,
-                    value,
-                    approach,
-                    artificial,
-                    pair_inertia * distance,
-                    PRESSURE,
-                    ARTIFICIAL,
-                    TENSILE,
-                    tensile,
-                )
-                force = vector_sum(force, -push * slope, gap)
-            if LAMINAR:
-                other = inverse + tl.load(fields + INVERSE * count + b, mask=here, other=1.0)
-                force = vector_sum(force, laminar * slope * square / distance * other, jump)
-            if LAPLACIAN:
-                part = slope * square / distance
-                diagonal -= part
-                total -= part * (field - tl.load(fields + FIELD * count + b, mask=here, other=0.0))
-
-    row = 0
-    if CONTINUITY:
-        row = store_scalar(out, row, count, a, live, divergence)
-    if DIFFUSION:
-        row = store_scalar(out, row, count, a, live, spread)
-    if CONCENTRATION:
-        row = store_vector(out, row, count, a, live, first, D)
-    if XSPH:
-        row = store_vector(out, row, count, a, live, drift, D)
-    if (PRESSURE or ARTIFICIAL) or LAMINAR:
-        row = store_vector(out, row, count, a, live, force, D)
-    if SHEPARD:
-        row = store_scalar(out, row, count, a, live, shepard_volume)
-        row = store_scalar(out, row, count, a, live, shepard_mass)
-    if RENORMALISATION:
-        row = store_matrix(out, row, count, a, live, second, D)
-    if LAPLACIAN:
-        row = store_scalar(out, row, count, a, live, total)
-        row = store_scalar(out, row, count, a, live, diagonal)
-    if GRADIENT:
-        row = store_vector(out, row, count, a, live, drift, D)
-    if CORRECTED_DIFFUSION:
-        row = store_scalar(out, row, count, a, live, spread)
-    if MOMENTS:
-        row = store_vector(out, row, count, a, live, first, D)
-        row = store_matrix(out, row, count, a, live, second, D)
-        row = store_vector(out, row, count, a, live, mass_first, D)
+            v, s, k, i, d, f = particle_fields(fields, count, b, here, gap, D, TERMS)
+            mass = load_scalar(fields, count, b, here, 0.0, MASS, D, MASS_READERS & TERMS)
+            other = load_scalar(fields, count, b, here, 0.0, STRESS, D, STRESS_READERS & TERMS)
+            jump = vector_sum(velocity, -1.0, v)
+            k, i = inertia + k, inverse + i
+            rates = add_rates(rates, gap, jump, value, slope, weight, k, TERMS)
+            differences = add_differences(differences, gap, slope, d - deviation, vector_sum(own_slope, 1.0, s), TERMS)
+            fillings = add_fillings(fillings, gap, value, weight, mass, TERMS)
+            acceleration = add_forces(
+                acceleration, gap, jump, square, distance, value, slope, stress, other, k, i, viscosities, TERMS
+            )
+            images = add_laplacian(images, square, distance, slope, field - f, TERMS)
+    store_sums(out, count, a, live, rates, differences, fillings, acceleration, images, D, TERMS)

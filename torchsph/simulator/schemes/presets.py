@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
+from .parts import XSPH
 from .projection import Projection
-from .weakly_compressible import XSPH, PotentialWall, PressureSource, WeaklyCompressible
-
-Scheme = WeaklyCompressible | Projection
+from .scheme import Scheme
+from .valve_models import PressureSource
+from .wall_models import PotentialWall
+from .weakly_compressible import WeaklyCompressible
 
 # 16 particles per cell of table 4.1 put a spacing at cell / 16^(1/3); the support of the truncated Gaussian (delta 3)
 # is one cell, so h = cell / 3
@@ -53,7 +56,7 @@ PRESETS: dict[str, Scheme] = {
 }
 
 
-def preset(name: str, **changes: object) -> Scheme:
+def preset(name: str, **changes: Any) -> Scheme:
     """The preset called ``name``, with some options changed.
 
     "default" is what the command line and the pipelines take: "projection", incompressible, for flow that fills its

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 from torchsph.pairs.smoothing_kernels import kernel
 
-from ..population import PopulationControl
-from .weakly_compressible import CompleteKernelWall, Reservoir
+from .population_control import PopulationControl
+from .scheme import Scheme
+from .valve_models import Reservoir, ValveOptions
+from .wall_models import CompleteKernelWall, WallModel
 
 
 @dataclass(frozen=True)
-class Projection:
+class Projection(Scheme):
     """Incompressible SPH by pressure projection (Cummins & Rudman 1999); None switches a term off.
 
     The step is limited by the flow's speed instead of that of sound.
@@ -31,6 +34,9 @@ class Projection:
         population: how particles that crowd are merged and holes seeded again, or None: neither.
     """
 
+    compressible: ClassVar[bool] = False
+    changeable: ClassVar[tuple[str, ...]] = ("shifting", "courant", "viscosity", "valve_strength")
+
     kernel: str = "wendland_c2"
     smoothing_ratio: float = 1.3
     laminar_viscosity: bool = True
@@ -41,8 +47,8 @@ class Projection:
     surface: float | None = None
     tolerance: float = 2e-2
     iterations: int = 200
-    wall: CompleteKernelWall = field(default_factory=CompleteKernelWall)
-    valve: Reservoir | None = field(default_factory=lambda: Reservoir(run_out=3.0))
+    wall: WallModel = field(default_factory=CompleteKernelWall)
+    valve: ValveOptions | None = field(default_factory=lambda: Reservoir(run_out=3.0))
     courant: float = 0.27
     max_step: float | None = 5e-4
     steps_per_frame: int | None = None
@@ -65,13 +71,14 @@ class Projection:
             raise ValueError(f"Projection.surface must lie in (0, 1) or be None, got {self.surface}")
         if self.shifting_speed not in ("local", "largest"):
             raise ValueError(f"Projection.shifting_speed must be 'local' or 'largest', got '{self.shifting_speed}'")
-        for name, kind in (("wall", CompleteKernelWall), ("valve", Reservoir | None)):
-            if not isinstance(getattr(self, name), kind):
+        for name, kind in (("wall", "CompleteKernelWall"), ("valve", "Reservoir or None")):
+            model = getattr(self, name)
+            if getattr(model, "needs_compressible", True) and not (name == "valve" and model is None):
                 raise ValueError(
-                    f"Projection.{name} must be a {'CompleteKernelWall' if name == 'wall' else 'Reservoir or None'}: "
-                    f"the others act through the equation of state; got {getattr(self, name)}"
+                    f"Projection.{name} must be a {kind}: the others act through the equation of state; got {model}"
                 )
 
-    # what the weakly compressible scheme has and this one has not
-    sound_speed = gamma = background_pressure = artificial_viscosity = density_diffusion = None
-    bulk_damping = xsph = step_floor = rollback = gamma_ramp = None
+    @property
+    def must_fill(self) -> bool:
+        """Whether the pressure is that of a fluid without a free surface."""
+        return self.surface is None

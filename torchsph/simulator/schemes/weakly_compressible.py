@@ -3,170 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 from torchsph.pairs.interface import CONTINUITY_FORMS, PRESSURE_FORMS
 from torchsph.pairs.smoothing_kernels import kernel
 
-from ..population import PopulationControl
+from .parts import XSPH, GammaRamp, Rollback
+from .population_control import PopulationControl
+from .scheme import Scheme
+from .valve_models import Reservoir, ValveOptions
+from .wall_models import CompleteKernelWall, WallModel
 
 ORDERS = ("thesis", "symplectic", "verlet", "predictor_corrector")
 
 
 @dataclass(frozen=True)
-class XSPH:
-    """XSPH (2.33): neighbours' velocities pull with strength ``epsilon``.
-
-    ``level`` is "velocity" (2.34: the momentum itself is smoothed, as in the thesis; strongly dissipative) or
-    "position" (Monaghan 1989: only the motion of the particles). ``form`` is "pairs" (the full sum) or "centroid"
-    (thesis 5.2, the "poor man's XSPH": towards the mean velocities of the cells around, ``pairs.centroid``). Where the
-    pair sums are compiled the full sum is the cheaper one: a tenth of a step in space, against two more steps.
-    """
-
-    epsilon: float = 0.2
-    level: str = "velocity"
-    form: str = "pairs"
-
-    def __post_init__(self) -> None:
-        if not 0 < self.epsilon <= 1:
-            raise ValueError(f"XSPH epsilon must lie in (0, 1], got {self.epsilon}")
-        if self.level not in ("velocity", "position"):
-            raise ValueError(f"XSPH level must be 'velocity' or 'position', got '{self.level}'")
-        if self.form not in ("pairs", "centroid"):
-            raise ValueError(f"XSPH form must be 'pairs' or 'centroid', got '{self.form}'")
-
-
-@dataclass(frozen=True)
-class GammaRamp:
-    """The exponent gamma of (2.25) grows after a start or an imposition (thesis 5.2), so that noise meets a soft fluid.
-
-    Attributes:
-        start: gamma at the imposition; it grows linearly in time to the scheme's gamma.
-        duration: s, after which the scheme's gamma acts.
-        keep: what stays while gamma grows. "prefactor": B = rho0 c^2 / gamma, so that the fluid starts softer, with
-            the sound speed c sqrt(gamma(t) / gamma), and takes longer steps; "sound_speed": c, so that only the
-            curvature of p(rho) changes (at small density deviations, next to nothing).
-    """
-
-    start: float = 1.0
-    duration: float = 0.01
-    keep: str = "prefactor"
-
-    def __post_init__(self) -> None:
-        if not self.start > 0 or not self.duration > 0:
-            raise ValueError(f"GammaRamp needs positive start and duration (s), got {self.start}, {self.duration}")
-        if self.keep not in ("prefactor", "sound_speed"):
-            raise ValueError(f"GammaRamp.keep must be 'prefactor' or 'sound_speed', got '{self.keep}'")
-
-
-@dataclass(frozen=True)
-class Rollback:
-    """A member that fails goes back to its last good state and tries again with steps half as long.
-
-    The others wait meanwhile; a search of neighbours that its way back calls for may change them by round-off.
-
-    Attributes:
-        tries: how often from one state, each time with steps half as long again; then the member is frozen there.
-        every: steps between the states that are kept; one is kept at the start of each imposed interval as well.
-        density: range of rho / rho0; a member with a particle outside counts as failed, before it is not finite.
-    """
-
-    tries: int = 3
-    every: int = 50
-    density: tuple[float, float] = (0.5, 2.0)
-
-    def __post_init__(self) -> None:
-        if self.tries < 1 or self.every < 1:
-            raise ValueError(f"Rollback needs at least one try and one step, got {self.tries}, {self.every}")
-        if not 0 <= self.density[0] < 1 < self.density[1]:
-            raise ValueError(f"Rollback.density must be a range around 1, got {self.density}")
-
-
-@dataclass(frozen=True)
-class PotentialWall:
-    """The thesis's wall (3.1, 3.2): potential U(s) = stiffness c^2 s^2 / 2 with s = 1 - d / reach for d < reach.
-
-    Attributes:
-        stiffness: wall potential at d = 0 in units of c^2 / 2.
-        reach: distance at which the potential starts, in particle spacings.
-        relaxation: time constant tau of the no-slip retardation at the wall, in reach / c; None: free slip. The factor
-            per step is xi = 1 - exp(-dt / tau * s), applied to the tangential velocity relative to the wall.
-    """
-
-    stiffness: float = 0.2
-    reach: float = 1.0
-    relaxation: float | None = 1.0
-
-    def __post_init__(self) -> None:
-        if not self.stiffness > 0 or not self.reach > 0:
-            raise ValueError(f"PotentialWall needs positive stiffness and reach, got {self.stiffness}, {self.reach}")
-        if self.relaxation is not None and not self.relaxation > 0:
-            raise ValueError(f"PotentialWall.relaxation must be positive or None, got {self.relaxation}")
-
-
-@dataclass(frozen=True)
-class CompleteKernelWall:
-    """Wall by the analytic kernel integrals behind it (Ferrand et al. 2013): no wall particles, one look-up each.
-
-    Attributes:
-        no_slip: laminar friction with the wall (True) or free slip.
-        gap: particles are kept this far inside the wall, in particle spacings.
-        sliding: for walls that slide past others at an edge, as the lid of a cavity does. What they sweep is then
-            integrated over the surface; otherwise the nearest wall's velocity stands for all that a kernel sees, and
-            a lid would seem to push the side walls (3 % of density in the corners, and noise from there).
-    """
-
-    no_slip: bool = True
-    gap: float = 0.05
-    sliding: bool = False
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.gap < 0.5:
-            raise ValueError(f"CompleteKernelWall.gap must lie in [0, 0.5), got {self.gap}")
-
-
-@dataclass(frozen=True)
-class PressureSource:
-    """A timed pressure source at an open valve (3.3, 3.4), softened inside ``core``.
-
-    The strength Q follows from continuity: the acceleration that changes the flux through the orifice as the volume of
-    the cavity demands, spread over a half-sphere around the orifice. ``core`` is in orifice radii.
-    """
-
-    core: float = 0.5
-
-    def __post_init__(self) -> None:
-        if not self.core > 0:
-            raise ValueError(f"PressureSource.core must be positive, got {self.core}")
-
-
-@dataclass(frozen=True)
-class Reservoir:
-    """An open valve as an opening with a buffer of particles behind it whose flux follows from dV/dt.
-
-    Attributes:
-        profile: "field" (the velocity profile of the imposed field, flat where it has none) or "flat".
-        relaxation: time (spacings per reference speed) in which a difference between the particles' volume and the
-            cavity's is let through the open valve on top of dV/dt, or None.
-        run_out: length (spacings) of free channel between an outlet and its buffer, 0 or more than 1. A scheme that
-            projects needs as much as its kernel reaches: no pressure can bring a particle to the speed of a prescribed
-            one beside it.
-    """
-
-    profile: str = "field"
-    run_out: float = 0.0
-    relaxation: float | None = 5.0
-
-    def __post_init__(self) -> None:
-        if self.profile not in ("field", "flat"):
-            raise ValueError(f"Reservoir.profile must be 'field' or 'flat', got '{self.profile}'")
-        if self.run_out != 0 and not self.run_out > 1:
-            raise ValueError(f"Reservoir.run_out must be 0 or more than 1 spacing, got {self.run_out}")
-        if self.relaxation is not None and not self.relaxation > 0:
-            raise ValueError(f"Reservoir.relaxation must be positive or None, got {self.relaxation}")
-
-
-@dataclass(frozen=True)
-class WeaklyCompressible:
+class WeaklyCompressible(Scheme):
     """Weakly compressible SPH with an equation of state; None switches a term off.
 
     Attributes:
@@ -206,6 +58,8 @@ class WeaklyCompressible:
         population: how particles that crowd are merged and holes seeded again, or None: neither.
     """
 
+    compressible: ClassVar[bool] = True
+
     kernel: str = "wendland_c2"
     smoothing_ratio: float = 1.3
     sound_speed: float = 5.0
@@ -226,8 +80,8 @@ class WeaklyCompressible:
     bulk_damping: float | None = 0.3
     shepard_period: int | None = None
     density_filter: str = "shepard"
-    wall: PotentialWall | CompleteKernelWall = field(default_factory=CompleteKernelWall)
-    valve: PressureSource | Reservoir | None = field(default_factory=Reservoir)
+    wall: WallModel = field(default_factory=CompleteKernelWall)
+    valve: ValveOptions | None = field(default_factory=Reservoir)
     order: str = "symplectic"
     courant: float = 0.35
     constant_volume: bool = False

@@ -7,7 +7,8 @@ from typing import Any
 
 from torch import Tensor
 
-from torchsph.pairs.interface import Backend, square_length
+from torchsph.pairs.interface import Backend
+from torchsph.pairs.vectors import square_length
 
 from .particles import Particles
 

@@ -137,15 +137,15 @@ class Particles:
         return out.scatter_reduce(0, self.member, values, reduce, include_self=reduce == "sum")
 
 
-def held_rows(members: Tensor, particles: Particles, before: Tensor, after: Tensor) -> Tensor:
+def rows_frozen(members: Tensor, particles: Particles, before: Tensor, after: Tensor) -> Tensor:
     """``before`` for the particles of some members (members,) bool, ``after`` for the others; (N, ...)."""
-    mine = members[particles.member]
-    return torch.where(mine.reshape(-1, *[1] * (after.ndim - 1)), before, after)
+    frozen = members[particles.member]
+    return torch.where(frozen.reshape(-1, *[1] * (after.ndim - 1)), before, after)
 
 
-def held(members: Tensor, before: Particles, after: Particles) -> Particles:
+def frozen(members: Tensor, before: Particles, after: Particles) -> Particles:
     """``after`` with the state of some members (members,) bool as it was before."""
     keep = {n: getattr(after, n) for n in ("position", "velocity", "deviation")}
     if before.pressure is not None:
         keep["pressure"] = after.pressure
-    return after.changed(**{n: held_rows(members, after, getattr(before, n), value) for n, value in keep.items()})
+    return after.changed(**{n: rows_frozen(members, after, getattr(before, n), value) for n, value in keep.items()})

@@ -2,28 +2,60 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import math
+from dataclasses import dataclass, field, fields
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from ..stepping.terms import LIMITS
+# what may limit a time step, in the order of ``stepping.terms.step_limits``
+LIMITS = ("acoustic", "viscous", "force", "frame", "end of interval")
+_DTYPES = {bool: torch.bool, int: torch.int64, float: torch.float64}
+
+
+@dataclass(frozen=True)
+class _Account:
+    """One account: what it starts from, which gives its type too, and who reads it.
+
+    Attributes:
+        start: first value.
+        by: None: one number a member; "valves", "limits": one for each of these as well.
+        pooled: whether ``Record.totals`` sums it.
+        taken_back: whether a stretch of the run that is taken back (``Rollback``) takes back what it added: it happened
+            to the fluid, not to the computation.
+    """
+
+    start: float
+    by: str | None = None
+    pooled: bool = False
+    taken_back: bool = False
+
+
+def _account(
+    start: float = 0, *, by: str | None = None, pooled: bool = False, taken_back: bool = False
+) -> Any:  # as ``dataclasses.field``
+    return field(init=False, metadata={"account": _Account(start, by, pooled, taken_back)})
 
 
 @dataclass
 class Record:
-    """Accounts of a run.  All tensors (members,), counts int64; speeds in m/s.
+    """Accounts of a run.  All tensors (members,), counts int64, other numbers float64; speeds in m/s.
+
+    A new account is one line below and one here: it is made, summed, taken back and shown from there.
 
     Attributes:
-        steps: time steps taken. failed: a non-finite state appeared; the member is frozen at its last good state.
+        members: number of members. valves: number of valves. device: of the tensors.
+        steps: time steps taken.
+        failed: a non-finite state appeared; the member is frozen at its last good state.
         smallest_density, largest_density: over time and particles, relative to the rest density.
         largest_mach: largest |v| / c.
         outside: particles beyond the wall now, in no open valve.
         crossed_wall: how often a particle was found beyond the wall and put back.
         inserted, removed: particles that entered and left, by valve: (members, valves).
-        merged, reseeded: particles that population control merged into others, and that it put into holes.
         inflow, outflow: volume that entered and left, by valve, m^D (in a plane m^2): (members, valves).
         cavity_change: of the cavity's volume since the run began, m^D: what has to enter less what leaves.
+        merged, reseeded: particles that population control merged into others, and that it put into holes.
         energy_in, energy_out: kinetic energy and work of pressure that entered and left with it, by valve, J (in a
             plane J/m): (members, valves).
         wall_work: done on the fluid by moving walls: pressure, friction and stops; J (in a plane J/m).
@@ -31,116 +63,88 @@ class Record:
         filling: volume of the particles inside over that of the cavity now; NaN in scenes without walls. Where a closed
             cavity changes its volume, it goes along: a weakly compressible fluid is compressed or thinned, and the
             incompressible scheme reports the mismatch below.
-        limited_by: how many steps each limit decided, (members, limits); names in ``terms.LIMITS``.
+        limited_by: how many steps each limit decided, (members, limits); names in ``LIMITS``.
+        searches: neighbour searches, of all members together.
         reductions: how often a limit asked for a step shorter than the step before by more than a hundredth.
         floored: steps that the scheme's floor kept longer than the limits asked for; such a run may be unstable.
+        rollbacks: how often the member went back to an earlier state to try again with shorter steps.
+        overflows: searches made again because the lists outgrew their room, of all members together.
         pressure_iterations: of the solver of projections. unconverged: projections that ended without convergence.
         largest_mismatch: largest mean divergence, internal, that no pressure could answer (a closed cavity whose volume
             changes, or a flux that differs from it); it is spread evenly and so stays with the particles' volume.
-        rollbacks: how often the member went back to an earlier state to try again with shorter steps.
-        searches, overflows: neighbour searches, and those made again because the lists outgrew their room; both of all
-            members together.
     """
 
     members: int
     valves: int = 0
     device: str | torch.device = "cpu"
-    searches: int = 0
-    overflows: int = 0
-    steps: Tensor = field(init=False)
-    failed: Tensor = field(init=False)
-    smallest_density: Tensor = field(init=False)
-    largest_density: Tensor = field(init=False)
-    largest_mach: Tensor = field(init=False)
-    outside: Tensor = field(init=False)
-    crossed_wall: Tensor = field(init=False)
-    inserted: Tensor = field(init=False)
-    removed: Tensor = field(init=False)
-    merged: Tensor = field(init=False)
-    reseeded: Tensor = field(init=False)
-    inflow: Tensor = field(init=False)
-    outflow: Tensor = field(init=False)
-    cavity_change: Tensor = field(init=False)
-    energy_in: Tensor = field(init=False)
-    energy_out: Tensor = field(init=False)
-    wall_work: Tensor = field(init=False)
-    source_work: Tensor = field(init=False)
-    filling: Tensor = field(init=False)
-    limited_by: Tensor = field(init=False)
-    reductions: Tensor = field(init=False)
-    floored: Tensor = field(init=False)
-    rollbacks: Tensor = field(init=False)
-    pressure_iterations: Tensor = field(init=False)
-    unconverged: Tensor = field(init=False)
-    largest_mismatch: Tensor = field(init=False)
+    steps: Tensor = _account(pooled=True)
+    failed: Tensor = _account(False, pooled=True)
+    smallest_density: Tensor = _account(1.0)
+    largest_density: Tensor = _account(1.0)
+    largest_mach: Tensor = _account(0.0)
+    outside: Tensor = _account(pooled=True)
+    crossed_wall: Tensor = _account(pooled=True, taken_back=True)
+    inserted: Tensor = _account(by="valves", pooled=True, taken_back=True)
+    removed: Tensor = _account(by="valves", pooled=True, taken_back=True)
+    inflow: Tensor = _account(0.0, by="valves", taken_back=True)
+    outflow: Tensor = _account(0.0, by="valves", taken_back=True)
+    cavity_change: Tensor = _account(0.0)
+    merged: Tensor = _account(pooled=True, taken_back=True)
+    reseeded: Tensor = _account(pooled=True, taken_back=True)
+    energy_in: Tensor = _account(0.0, by="valves", taken_back=True)
+    energy_out: Tensor = _account(0.0, by="valves", taken_back=True)
+    wall_work: Tensor = _account(0.0, taken_back=True)
+    source_work: Tensor = _account(0.0, taken_back=True)
+    filling: Tensor = _account(math.nan)
+    limited_by: Tensor = _account(by="limits")
+    searches: int = field(default=0, init=False)
+    reductions: Tensor = _account()
+    floored: Tensor = _account()
+    rollbacks: Tensor = _account()
+    overflows: int = field(default=0, init=False)
+    pressure_iterations: Tensor = _account()
+    unconverged: Tensor = _account()
+    largest_mismatch: Tensor = _account(0.0)
 
     def __post_init__(self) -> None:
-        def counts(*shape: int) -> Tensor:
-            return torch.zeros((self.members, *shape), dtype=torch.int64, device=self.device)
+        sizes = {None: (), "valves": (self.valves,), "limits": (len(LIMITS),)}
+        for name, account in self._accounts().items():
+            shape, dtype = (self.members, *sizes[account.by]), _DTYPES[type(account.start)]
+            setattr(self, name, torch.full(shape, account.start, dtype=dtype, device=self.device))
 
-        self.steps, self.outside, self.crossed_wall = counts(), counts(), counts()
-        self.reductions, self.floored, self.rollbacks = counts(), counts(), counts()
-        self.pressure_iterations, self.unconverged = counts(), counts()
-        self.merged, self.reseeded = counts(), counts()
-        self.inserted, self.removed, self.limited_by = counts(self.valves), counts(self.valves), counts(len(LIMITS))
-        self.failed = torch.zeros(self.members, dtype=torch.bool, device=self.device)
-        one = torch.ones(self.members, dtype=torch.float64, device=self.device)
-        self.smallest_density, self.largest_density = one.clone(), one.clone()
-        self.inflow, self.outflow, self.energy_in, self.energy_out = (
-            one[:, None].repeat(1, self.valves) * 0.0 for _ in range(4)
-        )
-        self.filling = one * float("nan")
-        self.largest_mach, self.largest_mismatch, self.cavity_change, self.wall_work, self.source_work = (
-            torch.zeros_like(one) for _ in range(5)
-        )
+    @classmethod
+    def _accounts(cls) -> dict[str, _Account]:
+        return {f.name: f.metadata["account"] for f in fields(cls) if "account" in f.metadata}
 
     def note_density(self, smallest: Tensor, largest: Tensor) -> None:
         """Widen the density range by deviations (members,) from the rest density."""
         self.smallest_density = torch.minimum(self.smallest_density, 1.0 + smallest.double())
         self.largest_density = torch.maximum(self.largest_density, 1.0 + largest.double())
 
+    def kept(self) -> dict[str, Tensor]:
+        """Copies of the accounts that are taken back with a stretch of the run, by name."""
+        return {name: getattr(self, name).clone() for name, account in self._accounts().items() if account.taken_back}
+
+    def take_back(self, member: int, kept: dict[str, Tensor]) -> None:
+        """Put one member's accounts back to what they were when they were ``kept``."""
+        for name, account in kept.items():
+            getattr(self, name)[member] = account[member]
+
     def totals(self) -> dict[str, int]:
         """Sums over members, for pooling the accounts of several runs."""
-        return {
-            "steps": int(self.steps.sum()),
-            "failed": int(self.failed.sum()),
-            "outside": int(self.outside.sum()),
-            "crossed_wall": int(self.crossed_wall.sum()),
-            "inserted": int(self.inserted.sum()),
-            "removed": int(self.removed.sum()),
-            "merged": int(self.merged.sum()),
-            "reseeded": int(self.reseeded.sum()),
-        }
+        return {name: int(getattr(self, name).sum()) for name, account in self._accounts().items() if account.pooled}
 
     def summary(self) -> dict[str, object]:
         """Plain numbers for metrics files: lists over members."""
-        steps = {name: self.limited_by[:, k].tolist() for k, name in enumerate(LIMITS)}
-        return {
-            "steps": self.steps.tolist(),
-            "failed": self.failed.tolist(),
-            "density_range": [self.smallest_density.tolist(), self.largest_density.tolist()],
-            "largest_mach": self.largest_mach.tolist(),
-            "outside": self.outside.tolist(),
-            "crossed_wall": self.crossed_wall.tolist(),
-            "inserted": self.inserted.tolist(),
-            "removed": self.removed.tolist(),
-            "inflow": self.inflow.tolist(),
-            "outflow": self.outflow.tolist(),
-            "cavity_change": self.cavity_change.tolist(),
-            "merged": self.merged.tolist(),
-            "reseeded": self.reseeded.tolist(),
-            "energy_in": self.energy_in.tolist(),
-            "energy_out": self.energy_out.tolist(),
-            "wall_work": self.wall_work.tolist(),
-            "source_work": self.source_work.tolist(),
-            "filling": self.filling.tolist(),
-            "limited_by": steps,
-            "searches": self.searches,
-            "reductions": self.reductions.tolist(),
-            "floored": self.floored.tolist(),
-            "rollbacks": self.rollbacks.tolist(),
-            "overflows": self.overflows,
-            "pressure_iterations": self.pressure_iterations.tolist(),
-            "unconverged": self.unconverged.tolist(),
-            "largest_mismatch": self.largest_mismatch.tolist(),
-        }
+        shown: dict[str, object] = {}
+        for name in (f.name for f in fields(self)):
+            value = getattr(self, name)
+            if name in ("members", "valves", "device", "largest_density"):
+                continue
+            if name == "smallest_density":
+                shown["density_range"] = [value.tolist(), self.largest_density.tolist()]
+            elif name == "limited_by":
+                shown[name] = {limit: value[:, k].tolist() for k, limit in enumerate(LIMITS)}
+            else:
+                shown[name] = value.tolist() if isinstance(value, Tensor) else value
+        return shown

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from ..scene import Fluid
-from ..schemes.projection import Projection
-from ..schemes.weakly_compressible import GammaRamp, WeaklyCompressible
+from ..schemes.parts import GammaRamp
+from ..schemes.scheme import Scheme
 from ..state.units import Units
 
 # parameters that a scheme cannot do without; the others are switched off by None
@@ -22,14 +22,20 @@ class Parameters:
     """Numbers of a run; each is a float for all members, or a tensor (members,) with one for each.
 
     Attributes:
-        sound_speed: m/s. gamma: exponent of the Tait equation; both None in an incompressible scheme.
+        sound_speed: m/s; None in an incompressible scheme.
+        gamma: exponent of the Tait equation; None in an incompressible scheme.
         smoothing_ratio: h over the particle spacing.
-        courant, background_pressure, artificial_viscosity, density_diffusion, shifting, bulk_damping: as in
-            ``WeaklyCompressible``.
-        xsph: epsilon of the scheme's XSPH. viscosity: dynamic, Pa s.
+        courant: fraction of the limits of the time step.
+        background_pressure: as in ``WeaklyCompressible``.
+        artificial_viscosity: as in ``WeaklyCompressible``.
+        density_diffusion: as in ``WeaklyCompressible``.
+        shifting: as in ``WeaklyCompressible``.
+        bulk_damping: as in ``WeaklyCompressible``.
+        xsph: epsilon of the scheme's XSPH.
+        viscosity: dynamic, Pa s.
         valve_strength: factor on what drives the flow through open valves: on the strength Q of pressure sources
-            (thesis 3.4), and on differences between the pressures that valves are given. The flux of other valves
-            follows from the walls' motion, which leaves nothing to be set.
+            (Grønli 2017, eq. 3.4), and on differences between the pressures that valves are given. The flux of other
+            valves follows from the walls' motion, which leaves nothing to be set.
     """
 
     sound_speed: float | Tensor | None
@@ -46,18 +52,23 @@ class Parameters:
     valve_strength: float | Tensor = 1.0
 
     @classmethod
-    def of(cls, scheme: WeaklyCompressible | Projection, fluid: Fluid) -> Parameters:
-        """What a scheme and a fluid say."""
+    def of(cls, scheme: Scheme, viscosity: float) -> Parameters:
+        """What a scheme says, for a fluid of dynamic ``viscosity`` (Pa s)."""
         others = ("xsph", "viscosity", "valve_strength")
-        given = {f.name: getattr(scheme, f.name) for f in fields(cls) if f.name not in others}
+        given: dict[str, Any] = {f.name: getattr(scheme, f.name, None) for f in fields(cls) if f.name not in others}
         return cls(
             **given,
             xsph=None if scheme.xsph is None else scheme.xsph.epsilon,
-            viscosity=fluid.viscosity if scheme.laminar_viscosity else None,
+            viscosity=viscosity if scheme.laminar_viscosity else None,
         )
 
     def changed(self, like: Tensor, members: int, **values: float | Sequence[float] | Tensor | None) -> Parameters:
-        """A copy with some values replaced; rows of one value a member become tensors of the type of ``like``.
+        """A copy with some values replaced.
+
+        Args:
+            like: whose type and device rows of one value a member get.
+            members: number of members.
+            **values: by name, each a number, a row (members,), or None to switch a term off.
 
         Raises:
             ValueError: an unknown name, a number that cannot be, or rows of another length than ``members``.
@@ -66,7 +77,8 @@ class Parameters:
         for name in values:
             if name not in known:
                 raise ValueError(f"unknown parameter '{name}'; known: {', '.join(known)}")
-        return replace(self, **{name: _checked(name, value, like, members) for name, value in values.items()})
+        checked = {name: _checked(name, value, like, members) for name, value in values.items()}
+        return Parameters(**{**vars(self), **checked})
 
 
 def _checked(
@@ -83,12 +95,26 @@ def _checked(
     if not bool((fine & torch.isfinite(row)).all()):
         wanted = "positive" if name in _NEEDED else "not negative"
         raise ValueError(f"parameter '{name}' must be {wanted} and finite, got {row.tolist()}")
-    return row if row.ndim else float(value)
+    return row if isinstance(value, Sequence) or row.ndim else float(value)
 
 
 @dataclass(frozen=True)
 class Coefficients:
-    """Parameters in internal units: floats, or tensors (members,); a term that is None is not computed."""
+    """Parameters in internal units: floats, or tensors (members,); a term that is None is not computed.
+
+    Attributes:
+        sound_speed: None in an incompressible scheme; see ``sound``.
+        gamma: None in an incompressible scheme; see ``exponent``.
+        smoothing_length: h.
+        courant: fraction of the limits of the time step.
+        background: pressure p0 / rho0 in units of the squared sound speed.
+        artificial: alpha c of the artificial viscosity.
+        diffusion: delta of the density's diffusion.
+        shifting: strength A of the shifting.
+        bulk_damping: coefficient b of the pressure that damps sound.
+        xsph: epsilon.
+        viscosity: kinematic.
+    """
 
     sound_speed: float | Tensor | None
     gamma: float | Tensor | None
@@ -102,22 +128,44 @@ class Coefficients:
     xsph: float | Tensor | None
     viscosity: float | Tensor | None
 
+    @property
+    def sound(self) -> float | Tensor:
+        """The speed of sound, internal, of a scheme that has one."""
+        if self.sound_speed is None:
+            raise ValueError("an incompressible scheme has no speed of sound")
+        return self.sound_speed
+
+    @property
+    def exponent(self) -> float | Tensor:
+        """Gamma of the equation of state, of a scheme that has one."""
+        if self.gamma is None:
+            raise ValueError("an incompressible scheme has no equation of state, and so no gamma")
+        return self.gamma
+
     @classmethod
     def of(cls, parameters: Parameters, units: Units, density: float) -> Coefficients:
-        """``parameters`` in units of length and speed, for a fluid of ``density`` (kg/m^3)."""
+        """Parameters in internal units.
+
+        Args:
+            parameters: of the run.
+            units: of length and speed.
+            density: of the fluid at rest, kg/m^3.
+        """
         p = parameters
         viscosity = _acting(p.viscosity)
         if viscosity is not None:
             viscosity = viscosity / density / units.kinematic_viscosity
         sound = None if p.sound_speed is None else p.sound_speed / units.speed
         artificial = _acting(p.artificial_viscosity)
+        if artificial is not None and sound is not None:
+            artificial = artificial * sound
         return cls(
             sound_speed=sound,
             gamma=p.gamma,
             smoothing_length=p.smoothing_ratio,
             courant=p.courant,
             background=_acting(p.background_pressure),
-            artificial=None if artificial is None else artificial * sound,
+            artificial=artificial,
             diffusion=p.density_diffusion,
             shifting=p.shifting,
             bulk_damping=p.bulk_damping,
@@ -126,15 +174,20 @@ class Coefficients:
         )
 
     def ramped(self, ramp: GammaRamp, elapsed: Tensor) -> Coefficients:
-        """With gamma as it is ``elapsed`` (members,) after the imposition, in the unit of the ramp's duration."""
-        share = (elapsed / ramp.duration).clamp(0.0, 1.0)
-        final = torch.as_tensor(self.gamma, dtype=share.dtype, device=share.device)
-        gamma = ramp.start + share * (final - ramp.start)
+        """With gamma as it is some time after an imposition.
+
+        Args:
+            ramp: how gamma grows.
+            elapsed: (members,), since the imposition, in the unit of the ramp's duration.
+        """
+        progress = (elapsed / ramp.duration).clamp(0.0, 1.0)
+        final = torch.as_tensor(self.exponent, dtype=progress.dtype, device=progress.device)
+        gamma = ramp.start + progress * (final - ramp.start)
         if ramp.keep == "sound_speed":
             return replace(self, gamma=gamma)
         softer = torch.sqrt(gamma / final)
         artificial = None if self.artificial is None else self.artificial * softer
-        return replace(self, gamma=gamma, sound_speed=self.sound_speed * softer, artificial=artificial)
+        return replace(self, gamma=gamma, sound_speed=self.sound * softer, artificial=artificial)
 
 
 def _acting(value: float | Tensor | None) -> float | Tensor | None:

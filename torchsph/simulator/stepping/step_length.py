@@ -5,16 +5,21 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchsph.pairs.interface import square_length
+from torchsph.pairs.vectors import square_length
 
 from ..state.particles import Particles
-from ..state.record import Record
+from ..state.record import LIMITS, Record
 from .coefficients import Coefficients
-from .terms import LIMITS, step_limits
+from .terms import step_limits
 
 
 class StepControl:
-    """Adaptive steps of all members: acoustic, viscous and force limits with a floor, named in the record."""
+    """Adaptive steps of all members: acoustic, viscous and force limits with a floor, named in the record.
+
+    Args:
+        record: account of the run.
+        floor: fraction of the acoustic limit at rest below which no step is cut, or None.
+    """
 
     def __init__(self, record: Record, floor: float | None) -> None:
         self._record, self._floor = record, floor
@@ -29,11 +34,18 @@ class StepControl:
         longest: float,
         factor: Tensor | None = None,
     ) -> Tensor:
-        """Each member's step (members,) float64: the smallest limit, evened out over what is left of the interval.
+        """Each member's step: the smallest limit, evened out over what is left of the interval.
 
         Args:
-            acceleration: (N, D) of the last step. left: (members,), 0 for members that wait. longest: limit by frames.
-            factor: (members,) that the limits are multiplied by, or None. All in internal units.
+            particles: before the step.
+            acceleration: (N, D), internal, of the last step.
+            coefficients: in use.
+            left: (members,) float64, internal time to the end of the interval; 0 for members that wait.
+            longest: limit by frames, internal time.
+            factor: (members,) that the limits are multiplied by, or None.
+
+        Returns:
+            (members,) float64, internal time.
         """
         c, record = coefficients, self._record
         speed = particles.per_member(square_length(particles.velocity), "amax").sqrt()
@@ -62,9 +74,9 @@ class StepControl:
         """The limits (3, members), none below the scheme's floor; the record counts where that changed the step."""
         if self._floor is None:
             return limits
-        floor = self._floor * c.courant * c.smoothing_length / c.sound_speed
+        floor = self._floor * c.courant * c.smoothing_length / c.sound
         # the viscous limit is known beforehand and no accident: it stays
-        held = (limits[[0, 2]] < floor).any(0) & (limits[1] > floor)
-        self._record.floored += active & held
+        raised = (limits[[0, 2]] < floor).any(0) & (limits[1] > floor)
+        self._record.floored += active & raised
         floor = torch.as_tensor(floor, dtype=limits.dtype, device=limits.device)
         return torch.stack([limits[0].maximum(floor), limits[1], limits[2].maximum(floor)])

@@ -1,4 +1,4 @@
-"""Single-particle pieces of the weakly compressible scheme: equation of state, time-step limits, shifting."""
+"""Single-particle pieces of the schemes: equation of state, time-step limits, the viscous term's softening."""
 
 from __future__ import annotations
 
@@ -6,18 +6,14 @@ import torch
 from torch import Tensor
 
 from torchsph.pairs.backends.reference import SINGULARITY
-from torchsph.pairs.interface import Rates, per_particle, square_length
 from torchsph.pairs.smoothing_kernels import SmoothingKernel
 
-from ..imposing import solve_small
-from ..state.particles import Particles
-
-# names of the time-step limits, in the order of ``step_limits``
-LIMITS = ("acoustic", "viscous", "force", "frame", "end of interval")
+# points of the quadrature over the kernel's radius
+_QUADRATURE = 4001
 
 
 def tait_pressure(deviation: Tensor, sound_speed: float | Tensor, gamma: float | Tensor) -> Tensor:
-    """p / rho0 = c^2 / gamma ((1 + d)^gamma - 1) (2.25 without the background), (N,).
+    """p / rho0 = c^2 / gamma ((1 + d)^gamma - 1) (N,): Grønli 2017, eq. 2.25, without the background.
 
     gamma = 1 is the linear equation of state; expm1/log1p keep the digits of a small deviation d in float32.
     """
@@ -41,10 +37,20 @@ def step_limits(
     viscosity: float | Tensor,
     courant: float | Tensor,
 ) -> Tensor:
-    """Acoustic, viscous and force limits (Morris et al. 1997 eqs. 30-32) of each member: (3, members), internal time.
+    """Acoustic, viscous and force limits of the time step (Morris et al. 1997, eqs. 30-32).
 
-    ``speed`` and ``acceleration`` (members,) are the largest of each member. With the usual Courant fraction of 0.35
-    the force limit is close to the customary 0.25 sqrt(h / |a|).
+    With the usual Courant fraction of 0.35 the force limit is close to the customary 0.25 sqrt(h / |a|).
+
+    Args:
+        speed: (members,), largest of each member, internal.
+        acceleration: (members,), largest of each member, internal.
+        smoothing_length: internal.
+        sound_speed: internal; 0 in an incompressible fluid.
+        viscosity: kinematic, internal.
+        courant: fraction of each limit.
+
+    Returns:
+        (3, members), internal time.
     """
     h = smoothing_length
     acoustic = courant * h / (sound_speed + speed).clamp_min(torch.finfo(speed.dtype).tiny)
@@ -54,61 +60,12 @@ def step_limits(
     return torch.stack([acoustic.expand_as(speed), viscous, force])
 
 
-def shepard_deviation(sums: Rates) -> Tensor:
-    """Density deviation (N,) after Shepard's filter (2.20)."""
-    return sums.shepard_mass / sums.shepard_volume - 1.0
-
-
-def mls_deviation(sums: Rates) -> Tensor:
-    """Density deviation (N,) of moving least squares (Colagrossi & Landrini 2003 eqs. 12-14; Dilts 1999).
-
-    Exact for a linear density; where the neighbours lie in a line or plane, Shepard's value.
-    """
-    tilt = -solve_small(sums.moment_second, sums.moment_first[:, :, None])[:, :, 0]
-    volume = sums.shepard_volume + (tilt * sums.moment_first).sum(1)
-    return (sums.shepard_mass + (tilt * sums.moment_mass).sum(1)) / volume - 1.0
-
-
 def softened_share(kernel: SmoothingKernel, dimension: int) -> float:
     """Part of the viscosity that acts, because the pair term has r^2 / (r^2 + 0.01 h^2) against coinciding particles.
 
-    The ratio of the term's second moments over a continuum with and without the softening (Espanol & Revenga 2003
+    The ratio of the term's second moments over a continuum with and without the softening (Espanol & Revenga 2003,
     eq. 23 is the one without); 0.984 for Wendland C2 in a plane. Dividing the viscosity by it makes flows decay right.
     """
     r = torch.linspace(0.0, kernel.support, _QUADRATURE, dtype=torch.float64)[1:-1]
     weight = kernel.gradient_factor(r, 1.0, dimension) * r ** (dimension + 1)
     return float((weight * r**2 / (r**2 + SINGULARITY)).sum() / weight.sum())
-
-
-def shifting_displacement(
-    particles: Particles,
-    concentration: Tensor,
-    step: Tensor,
-    smoothing_length: float | Tensor,
-    strength: float | Tensor,
-    largest: bool = False,
-    surface: float | None = None,
-) -> Tensor:
-    """Displacement -A h |v| dt grad C that evens out the particles (Lind et al. 2012, speed-limited form), (N, D).
-
-    A floor on the speed keeps a resting fluid from freezing in disorder; a cap of a tenth of a spacing keeps the
-    shift below anything that the velocity would have to be corrected for. With ``largest`` the speed is the largest
-    of the member (Sun et al. 2017 eq. 14), so that stagnation points are evened out as well. Particles with
-    h |grad C| above ``surface`` lie at a free surface and stay: there the gradient points out of the fluid (0.74 on a
-    plane surface for Wendland C2, 0.03 two spacings below).
-    """
-    speed = square_length(particles.velocity).sqrt().clamp_min(_SPEED_FLOOR)
-    if largest:
-        speed = particles.per_member(speed, "amax").index_select(0, particles.member)
-    amount = per_particle(strength * smoothing_length, particles.member) * speed * per_particle(step, particles.member)
-    shift = -amount[:, None] * concentration
-    if surface is not None:
-        steepness = per_particle(smoothing_length, particles.member) * square_length(concentration).sqrt()
-        shift = shift * (steepness < surface)[:, None]
-    length = square_length(shift).sqrt()
-    return shift * (_SHIFT_CAP / length.clamp_min(_SHIFT_CAP))[:, None]
-
-
-_QUADRATURE = 4001
-_SPEED_FLOOR = 0.05
-_SHIFT_CAP = 0.1

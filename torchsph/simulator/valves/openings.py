@@ -1,4 +1,4 @@
-"""An open orifice as the particles' simulator sees it: its plane, area, rim and the channel behind it."""
+"""Open orifices as particles see them: plane, area, rim and the channel behind it, at the present time."""
 
 from __future__ import annotations
 
@@ -6,15 +6,24 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from geometry import OrificePlane
+from geometry import OrificePlane, orifices
 from geometry.motion.orifices import rim_distance
-from torchsph.pairs.interface import square_length
+from torchsph.pairs.vectors import square_length
+
+from ..scene import Scene, Valve
+from ..state.clock import Clock
+from ..state.units import Units
 
 # half the width (spacings) over which what stands over an opening is blended in
 _RIM = 0.5
+# points across the radius of an opening in which its flux is read
+_QUADRATURE = 24
+# opening planes kept in memory, and the part of its area and of a spacing by which an opening may differ from its plane
+_KEPT_PLANES = 64
+_AREA_CHANGE, _PLACE_CHANGE = 0.01, 0.1
 
 
-class Frame:
+class OpeningPlane:
     """An opening in internal units on the device."""
 
     def __init__(
@@ -41,6 +50,7 @@ class Frame:
         self.velocity = tensor(velocity)
         self._outline, self._edges = tensor(plane.outline), torch.from_numpy(plane.edges).to(device)
         self.radius = float(np.linalg.norm(plane.outline, axis=1).max())
+        self._quadrature: Tensor | None = None
         self._clear = float(self.inset(self.centre[None]).clamp_min(0.0))  # nothing of the rim is nearer to the middle
 
     def height(self, position: Tensor) -> Tensor:
@@ -65,6 +75,16 @@ class Frame:
         aside = (position - self.centre - height[:, None] * self.normal).norm(dim=1)
         return (height > -0.5) & (aside < self.radius + 1.0)
 
+    def quadrature(self) -> Tensor:
+        """Points evenly over the opening, (n, D), much closer than particles: their mean is the opening's."""
+        if self._quadrature is None:
+            step = self.radius / _QUADRATURE
+            axis = torch.arange(-_QUADRATURE, _QUADRATURE, dtype=self.centre.dtype, device=self.centre.device) + 0.5
+            flat = step * torch.cartesian_prod(*[axis] * self.basis.shape[0]).reshape(-1, self.basis.shape[0])
+            place = self.centre + flat @ self.basis
+            self._quadrature = place[self.inset(place) > 0]
+        return self._quadrature
+
     def lattice(self, length: float) -> Tensor:
         """Unit lattice in the channel of the given length behind the opening, (n, D)."""
         reach = int(np.ceil(self.radius)) + 1
@@ -74,3 +94,71 @@ class Frame:
         place = place[self.inset(place) > 0]
         layers = torch.arange(int(length), dtype=place.dtype, device=place.device) + 0.5
         return (place[:, None, :] + layers[None, :, None] * self.normal).reshape(-1, self.centre.shape[0])
+
+
+class Openings:
+    """All openings of a scene's valves; a region may consist of several.
+
+    Attributes:
+        all: the orifices. valve_of: of each opening, the number of its valve. valves: those of the scene.
+        given: numbers of the openings at a given pressure.
+    """
+
+    def __init__(self, scene: Scene, units: Units, device: str, dtype: torch.dtype) -> None:
+        if scene.walls is None:
+            raise ValueError("a scene with valves needs walls: the valves are orifices of the wall")
+        self.motion, self.units, self._device, self._dtype = scene.walls, units, device, dtype
+        self.valves: tuple[Valve, ...] = scene.valves
+        labels = {valve.region: number for number, valve in enumerate(scene.valves)}
+        self.all = [orifice for orifice in orifices(self.motion) if orifice.label in labels]
+        self.valve_of = [labels[orifice.label] for orifice in self.all]
+        self.given = [n for n, valve in enumerate(self.valve_of) if self.valves[valve].pressure is not None]
+        # m^3/s (m^2/s in a plane) of one internal unit of volume per time
+        self.flux_unit = units.length**self.motion.dimension / units.time
+        self._pace = self._resting_time()
+        self._planes: dict[tuple[int, int], OpeningPlane] = {}
+
+    def _resting_time(self) -> float | None:
+        """Time (s) in which no opening's area, or place, changes by more than this module allows; None: they rest."""
+        if not self.motion.moves:
+            return None
+        fastest = 0.0
+        for opening in self.all:
+            planes = [opening.at(float(t)) for t in self.motion.time]
+            for before, after, span in zip(planes, planes[1:], np.diff(self.motion.time), strict=False):
+                grown = abs(after.area / before.area - 1.0) / _AREA_CHANGE
+                gone = float(np.linalg.norm(after.centroid - before.centroid)) / (_PLACE_CHANGE * self.units.length)
+                fastest = max(fastest, max(grown, gone) / span)
+        return 1.0 / fastest if fastest > 0.0 else None
+
+    def plane(self, number: int, time: float) -> OpeningPlane:
+        """Opening ``number`` at ``time`` (s), to within the little that it may change unseen."""
+        if self._pace is not None:
+            time = round(time / self._pace) * self._pace
+        if not self.motion.period:
+            time = min(max(time, float(self.motion.time[0])), float(self.motion.time[-1]))
+        label = (number, 0 if self._pace is None else int(round(time / self._pace)))
+        if label not in self._planes:
+            if len(self._planes) > _KEPT_PLANES:
+                self._planes.clear()
+            opening = self.all[number]
+            self._planes[label] = OpeningPlane(
+                opening.at(time),
+                opening.velocity(time) / self.units.speed,
+                self.units.length,
+                self._dtype,
+                self._device,
+            )
+        return self._planes[label]
+
+    def active(self, clock: Clock) -> list[tuple[int, OpeningPlane]]:
+        """(number, plane now) of the openings of open valves."""
+        return [(n, self.plane(n, clock.mean)) for n, one in enumerate(self.all) if one.label in clock.open_regions]
+
+    def shut(self, clock: Clock) -> list[int]:
+        """Numbers of the openings of valves that are shut."""
+        return [n for n, one in enumerate(self.all) if one.label not in clock.open_regions]
+
+    def valve(self, number: int) -> Valve:
+        """The valve of an opening."""
+        return self.valves[self.valve_of[number]]

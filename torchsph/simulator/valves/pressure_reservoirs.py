@@ -6,22 +6,17 @@ velocity along the normal alone taken from the fluid, by first-order moving leas
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import torch
 from torch import Tensor
 
 from torchsph.pairs.interface import Backend
+from torchsph.pairs.moving_least_squares import fetch_at
 
-from ..imposing import fetch_at
-from ..scene import Valve
+from ..state.clock import Clock
 from ..state.particles import RESERVOIR, Particles
-from .openings import Frame
-
-if TYPE_CHECKING:
-    from ..domain import Domain
-    from ..stepping.projection import ProjectionStepper
-    from ..stepping.weakly_compressible import Stepper
+from .openings import OpeningPlane, Openings
 
 # depth (spacings) inside an opening at which the pressure is read, and the velocity of fluid that enters (new particles
 # are noisy); that of fluid that leaves is read in the opening itself, where it may still gather speed. Support of the
@@ -30,73 +25,87 @@ _DEPTH, _ENTRY, _RADIUS = 1.0, 0.5, 2.0
 _REACH = _DEPTH + 1.5**2 * _RADIUS
 
 
-class PressureValves:
+class PressureScheme(Protocol):
+    """How a scheme knows the pressure of particles."""
+
+    def pressure(self, particles: Particles) -> Tensor:
+        """p / rho0 (N,)."""
+
+    def at_pressure(self, particles: Particles, row: Tensor, pressure: Tensor) -> Particles:
+        """Particles whose ``row`` (n,) carry ``pressure`` (n,), p / rho0."""
+
+
+class PressureReservoirs:
     """What drives the buffers of valves with a given pressure; internal units, all members at once.
+
+    Args:
+        openings: of the scene's valves.
+        backend: for what is read inside the openings.
+        support_radius: of the smoothing kernel.
+        pressure_unit: rho0 (v_ref)^2, Pa per internal p / rho0.
+        period: (D,) of the periodic box, or None.
 
     Attributes:
         kinds: (n,) int64, ``Particles.kind`` of these buffers, whose density is not the stepper's to change.
     """
 
-    def __init__(self, domain: Domain, backend: Backend) -> None:
-        self.domain, self._reservoirs, self._backend = domain, domain.reservoirs, backend
-        # rho0 (v_ref)^2: Pa per internal p / rho0
-        self._unit = domain.scene.fluid.density * domain.units.speed**2
-        self.kinds = torch.tensor([RESERVOIR + n for n in domain.reservoirs.given], device=domain.device)
+    def __init__(
+        self,
+        openings: Openings,
+        backend: Backend,
+        support_radius: float,
+        pressure_unit: float,
+        period: Tensor | None,
+        device: str,
+    ) -> None:
+        self._openings, self._backend, self._device = openings, backend, device
+        self._support_radius, self._unit, self._period = support_radius, pressure_unit, period
+        self.kinds = torch.tensor([RESERVOIR + n for n in openings.given], device=device)
 
-    @classmethod
-    def of(cls, domain: Domain, backend: Backend) -> PressureValves | None:
-        """None where no valve has a given pressure, so that it costs nothing."""
-        if domain.reservoirs is None or not domain.reservoirs.given:
-            return None
-        return cls(domain, backend)
-
-    def driven(self, particles: Particles, stepper: Stepper | ProjectionStepper) -> Particles:
+    def driven(self, particles: Particles, clock: Clock, scheme: PressureScheme) -> Particles:
         """Give the buffers the pressure of the present time, and the velocity of the fluid before them."""
-        active = [(n, frame) for n, frame in self._reservoirs.active() if n in self._reservoirs.given]
-        given = self._given([n for n, _ in active], particles.members)
-        for (number, frame), level in zip(active, given, strict=True):
+        active = [(n, plane) for n, plane in self._openings.active(clock) if n in self._openings.given]
+        given = self._given([n for n, _ in active], particles.members, clock)
+        for (number, plane), level in zip(active, given, strict=True):
             row = torch.nonzero(particles.kind == RESERVOIR + number).squeeze(1)
-            member, height = particles.member[row], frame.height(particles.position[row])
-            velocity, inside = self._followed(particles, row, frame, stepper)
+            member, height = particles.member[row], plane.height(particles.position[row])
+            velocity, inside = self._followed(particles, row, plane, scheme)
             static = level.to(velocity.dtype).index_select(0, member)
-            if self._valve(number).stagnation:
-                static = static - 0.5 * ((frame.velocity - velocity) @ frame.normal).clamp_min(0.0) ** 2
+            if self._openings.valve(number).stagnation:
+                static = static - 0.5 * ((plane.velocity - velocity) @ plane.normal).clamp_min(0.0) ** 2
             # the pressure goes on falling, or rising, as it does from inside to the opening: a step there would put
             # the opening a kernel's radius too far out
             slope = _mean(static - inside, member, particles.members)
-            reach = height.clamp_max(self.domain.support_radius) / _DEPTH
+            reach = height.clamp_max(self._support_radius) / _DEPTH
             pressure = static + slope.index_select(0, member) * reach
             particles = particles.changed(velocity=particles.velocity.index_copy(0, row, velocity))
-            particles = stepper.at_pressure(particles, row, pressure)
+            particles = scheme.at_pressure(particles, row, pressure)
         return particles
 
-    def _valve(self, number: int) -> Valve:
-        return self._reservoirs.valves[self._reservoirs.valve_of[number]]
-
-    def _given(self, numbers: list[int], members: int) -> list[Tensor]:
+    def _given(self, numbers: list[int], members: int, clock: Clock) -> list[Tensor]:
         """Pressure p / rho0 (members,) of openings, from their mean: a constant that all share moves nothing.
 
         Times each member's valve strength.
         """
-        times = self.domain.member_times(members).tolist()
-        rows = [[self._valve(n).pressure_at(t) for t in times] for n in numbers]
+        times = clock.of_members(members).tolist()
+        rows = [[self._openings.valve(n).pressure_at(t) for t in times] for n in numbers]
         if not rows:
             return []
-        table = torch.tensor(rows, dtype=torch.float64, device=self.domain.device) / self._unit
-        return list((table - table.mean(0)) * self.domain.valve_strength)
+        table = torch.tensor(rows, dtype=torch.float64, device=self._device) / self._unit
+        return list((table - table.mean(0)) * clock.valve_strength)
 
     def _followed(
-        self, particles: Particles, row: Tensor, frame: Frame, stepper: Stepper | ProjectionStepper
+        self, particles: Particles, row: Tensor, plane: OpeningPlane, scheme: PressureScheme
     ) -> tuple[Tensor, Tensor]:
         """What a buffer's particles in ``row`` find inside the opening: velocity (n, D) and p / rho0 (n,).
 
         The velocity is the opening's own, and the fluid's along the normal.
         """
-        mine, height = particles.select(row), frame.height(particles.position[row])
-        near = particles.select(particles.inside & (frame.height(particles.position).abs() < _REACH))
+        mine, height = particles.select(row), plane.height(particles.position[row])
+        near = particles.select(particles.inside & (plane.height(particles.position).abs() < _REACH))
 
         def read(values: Tensor, old: Tensor, depth: Tensor) -> Tensor:
-            place = mine.position - (height + depth)[:, None] * frame.normal
+            place = mine.position - (height + depth)[:, None] * plane.normal
             found = fetch_at(
                 self._backend,
                 place,
@@ -105,16 +114,16 @@ class PressureValves:
                 near.member,
                 values[:, None],
                 _RADIUS,
-                period=self.domain.period,
+                period=self._period,
             )
             return torch.where(found.covered, found.value[:, 0], old)
 
         deep = torch.full_like(height, _DEPTH)
-        old = (mine.velocity - frame.velocity) @ frame.normal
+        old = (mine.velocity - plane.velocity) @ plane.normal
         leaves = _mean(old, mine.member, mine.members).index_select(0, mine.member) > 0
-        along = read((near.velocity - frame.velocity) @ frame.normal, old, _ENTRY * (~leaves).to(deep.dtype))
-        pressure = read(stepper.pressure(near), stepper.pressure(mine), deep)
-        return frame.velocity + along[:, None] * frame.normal, pressure
+        along = read((near.velocity - plane.velocity) @ plane.normal, old, _ENTRY * (~leaves).to(deep.dtype))
+        pressure = read(scheme.pressure(near), scheme.pressure(mine), deep)
+        return plane.velocity + along[:, None] * plane.normal, pressure
 
 
 def _mean(values: Tensor, member: Tensor, members: int) -> Tensor:

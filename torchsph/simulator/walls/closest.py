@@ -10,17 +10,27 @@ from scipy.ndimage import distance_transform_edt
 
 from geometry import Grid, Surface
 from geometry.surfaces.closest import SurfaceIndex
-from torchsph.native.library import ClosestArguments, LibraryMissing, library
+from torchsph.native.library import LibraryMissing, library
+from torchsph.native.structures import ClosestArguments
 
 
 def closest_on_grid(grid: Grid, solid: Surface, values: np.ndarray, limit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Distance (n,), m, of every node to a surface, and ``values`` (nv, D) of its vertices at the closest point (n, D).
+    """The closest point of a surface to every node of a grid.
 
     Exact (for the faces as they are) where the distance is below ``limit`` (n,), m; farther away the closest point of
     a node that is, so that the distance is a bound from above. A node spacing has to be the same along all axes.
 
     Measured on one core, 263,424 nodes: 6,394 faces 0.10 s compiled and 0.57 s by the k-d tree, 160,636 faces 0.7 and
     1.4 s.
+
+    Args:
+        grid: n nodes.
+        solid: the surface, m.
+        values: (nv, D), of its vertices.
+        limit: (n,), m, distance below which the answer has to be exact.
+
+    Returns:
+        Distance (n,), m, and ``values`` at the closest point (n, D).
     """
     try:
         handle = library().handle
@@ -33,13 +43,14 @@ def _compiled(
     handle: ctypes.CDLL, grid: Grid, solid: Surface, values: np.ndarray, limit: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     dimension = grid.dimension
-    arrays = {
+    distance, carried = np.empty(grid.size), np.zeros((grid.size, dimension))
+    arrays: dict[str, np.ndarray] = {
         "vertices": np.ascontiguousarray(solid.vertices, np.float64),
         "values": np.ascontiguousarray(values, np.float64),
         "corners": np.ascontiguousarray(solid.faces, np.int32),
         "limit": np.ascontiguousarray(limit, np.float64),
-        "distance": np.empty(grid.size),
-        "carried": np.zeros((grid.size, dimension)),
+        "distance": distance,
+        "carried": carried,
     }
     handle.sph_grid_closest(
         ctypes.byref(
@@ -54,7 +65,7 @@ def _compiled(
             )
         )
     )
-    return arrays["distance"], arrays["carried"]
+    return distance, carried
 
 
 def closest_by_tree(grid: Grid, solid: Surface, values: np.ndarray, limit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

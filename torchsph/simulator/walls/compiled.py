@@ -1,40 +1,43 @@
 """What complete-kernel walls add to the particles' sums: one compiled pass where there is one, else torch's formulas.
 
-The formulas stand in ``walls``; the compiled pass (csrc/walls.cpp) reads a particle's walls as one row and writes each
-result once, which takes a fifth of the time of torch's passes over columns.
+The formulas stand in ``formulas``; the compiled pass (csrc/walls.cpp) reads a particle's walls as one row and writes
+each result once, which takes a fifth of the time of torch's passes over columns.
 """
 
 from __future__ import annotations
 
 import ctypes
+from dataclasses import dataclass
 from functools import lru_cache
 
 import torch
 from torch import Tensor
 
-from torchsph.native.library import REALS, LibraryMissing, WallArguments, address, library
-from torchsph.pairs.interface import PRESSURE_FORMS, per_particle
+from torchsph.native.library import REALS, LibraryMissing, address, library
+from torchsph.native.structures import WallArguments
+from torchsph.pairs.interface import PRESSURE_FORMS
+from torchsph.pairs.vectors import per_particle
 
-from .forces import SMALLEST_FRICTION_DISTANCE, SMALLEST_SHARE, WallSample, completed, friction, wall_pressure_force
+from .formulas import SMALLEST_COMPLETENESS, SMALLEST_FRICTION_DISTANCE, completed, friction, wall_pressure_force
+from .interface import CompleteWallSample, WallSample
 
 
 def complete_rates(
-    divergence: Tensor, crowding: Tensor | None, velocity: Tensor, wall: WallSample | None
+    divergence: Tensor, gradient: Tensor | None, velocity: Tensor, wall: CompleteWallSample
 ) -> tuple[Tensor, Tensor | None]:
-    """``walls.completed``: velocity divergence (N,) and crowding gradient (N, D) complete at walls."""
-    code = _compiled(wall, divergence, crowding, velocity)
-    if code is None:
-        return completed(divergence, crowding, velocity, wall)
+    """Velocity divergence (N,) and the concentration's gradient (N, D), complete at walls (``formulas.completed``)."""
+    walls = _compiled(wall, divergence, gradient, velocity)
+    if walls is None:
+        return completed(divergence, gradient, velocity, wall)
     velocity, divergence = velocity.contiguous(), divergence.contiguous()
-    crowding = None if crowding is None else crowding.contiguous()
-    whole, even = torch.empty_like(divergence), None if crowding is None else torch.empty_like(crowding)
-    code.sph_wall_rates(
-        _arguments(
-            wall,
+    gradient = None if gradient is None else gradient.contiguous()
+    whole, even = torch.empty_like(divergence), None if gradient is None else torch.empty_like(gradient)
+    walls.code.sph_wall_rates(
+        walls.arguments(
             velocity,
             velocity=velocity.data_ptr(),
             divergence=divergence.data_ptr(),
-            crowding=address(crowding),
+            crowding=address(gradient),
             whole_divergence=whole.data_ptr(),
             whole_crowding=address(even),
         )
@@ -45,7 +48,7 @@ def complete_rates(
 def complete_forces(
     acceleration: Tensor,
     velocity: Tensor,
-    wall: WallSample,
+    wall: CompleteWallSample,
     *,
     viscosity: float | Tensor | None,
     member: Tensor,
@@ -53,22 +56,30 @@ def complete_forces(
     pressure: Tensor | None = None,
     deviation: Tensor | None = None,
 ) -> Tensor:
-    """Pair accelerations (N, D) with the walls' pressure and friction, over the share of the kernel in the fluid.
+    """Pair accelerations with the walls' pressure and friction, over the part of the kernel in the fluid.
 
     Args:
-        viscosity: laminar, one or (members,), of no-slip walls; None: free slip. member: (N,) int64.
-        form, pressure, deviation: as in ``walls.wall_pressure_force``; pressure None: friction alone.
+        acceleration: (N, D), by pairs.
+        velocity: (N, D).
+        wall: walls at the particles.
+        viscosity: kinematic, one or (members,), of no-slip walls; None: free slip.
+        member: (N,) int64.
+        form: of the pressure force (``formulas.wall_pressure_force``).
+        pressure: (N,), p / rho0; None: friction alone.
+        deviation: (N,), of the density; needed with a pressure.
+
+    Returns:
+        (N, D), internal.
     """
-    code = _compiled(wall, acceleration, velocity, pressure, deviation)
-    if code is None:
+    walls = _compiled(wall, acceleration, velocity, pressure, deviation)
+    if walls is None:
         return _forces_by_torch(acceleration, velocity, wall, viscosity, member, form, pressure, deviation)
     acceleration, velocity = acceleration.contiguous(), velocity.contiguous()
     given = [None if t is None else t.contiguous() for t in (pressure, deviation)]
     nu = None if viscosity is None else torch.as_tensor(viscosity, dtype=torch.float64).reshape(-1).contiguous()
     out, member = torch.empty_like(acceleration), member.contiguous()
-    code.sph_wall_forces(
-        _arguments(
-            wall,
+    walls.code.sph_wall_forces(
+        walls.arguments(
             velocity,
             velocity=velocity.data_ptr(),
             form=PRESSURE_FORMS.index(form),
@@ -85,27 +96,35 @@ def complete_forces(
 
 
 def near_wall(
-    before: Tensor, after: Tensor, wall: WallSample, step: Tensor, member: Tensor, held: Tensor, gap: float
+    before: Tensor, after: Tensor, wall: WallSample, step: Tensor, member: Tensor, stopped: Tensor, gap: float
 ) -> tuple[Tensor, Tensor]:
-    """Particles (n,) int64 that end a step nearer to the wall than ``gap``, and their distance (n,) then.
+    """Particles that end a step too near to the wall.
 
     The distance that was seen is carried on to first order, with the wall's velocity.
 
     Args:
-        before, after: positions (N, D). step: (members,), internal. held: (N,) bool, particles that walls hold.
+        before: (N, D), positions that the walls were seen from.
+        after: (N, D), positions at the end of the step.
+        wall: walls as they were seen.
+        step: (members,), internal.
+        member: (N,) int64.
+        stopped: (N,) bool, particles that walls stop.
+        gap: distance that is near enough.
+
+    Returns:
+        Rows (n,) int64 of these particles, and their distance (n,) then.
     """
-    code = _compiled(wall, before, after)
-    if code is None:
+    walls = _compiled(wall, before, after)
+    if walls is None:
         moved = after - before - per_particle(step, member)[:, None] * wall.velocity
         distance = wall.distance + (moved * wall.normal).sum(1)
-        near = torch.nonzero((distance < gap) & held).squeeze(1)
+        near = torch.nonzero((distance < gap) & stopped).squeeze(1)
         return near, distance[near]
     near, distance = torch.empty_like(member), torch.empty_like(wall.distance, memory_format=torch.contiguous_format)
-    before, after, member, held = (t.contiguous() for t in (before, after, member, held))
+    before, after, member, stopped = (t.contiguous() for t in (before, after, member, stopped))
     step = step.double().contiguous()
-    found = code.sph_wall_near(
-        _arguments(
-            wall,
+    found = walls.code.sph_wall_near(
+        walls.arguments(
             after,
             before=before.data_ptr(),
             after=after.data_ptr(),
@@ -113,7 +132,7 @@ def near_wall(
             distance_stride=wall.distance.stride(0),
             step=step.data_ptr(),
             member=member.data_ptr(),
-            held=held.data_ptr(),
+            held=stopped.data_ptr(),
             gap=gap,
             near=near.data_ptr(),
             near_distance=distance.data_ptr(),
@@ -125,18 +144,18 @@ def near_wall(
 def _forces_by_torch(
     acceleration: Tensor,
     velocity: Tensor,
-    wall: WallSample,
+    wall: CompleteWallSample,
     viscosity: float | Tensor | None,
     member: Tensor,
     form: str,
     pressure: Tensor | None,
     deviation: Tensor | None,
 ) -> Tensor:
-    if pressure is not None:
+    if pressure is not None and deviation is not None:
         acceleration = acceleration + wall_pressure_force(form, pressure, deviation, wall)
     if viscosity is not None:
         acceleration = acceleration + friction(per_particle(viscosity, member), velocity, wall)
-    return acceleration / wall.share.clamp_min(SMALLEST_SHARE)[:, None]
+    return acceleration / wall.completeness.clamp_min(SMALLEST_COMPLETENESS)[:, None]
 
 
 class _Code:
@@ -157,29 +176,38 @@ def _code(dtype: torch.dtype) -> _Code | None:
         return None
 
 
-def _compiled(wall: WallSample | None, *tensors: Tensor | None) -> _Code | None:
+@dataclass(frozen=True)
+class _CompiledWalls:
+    """The compiled passes and the rows (N, C) of walls that they read."""
+
+    code: _Code
+    rows: Tensor
+
+    def arguments(self, vectors: Tensor, **arrays: int | float | None) -> object:
+        """Arguments of a pass over ``vectors`` (N, D), by reference."""
+        count, channels = self.rows.shape
+        return ctypes.byref(
+            WallArguments(
+                dimension=vectors.shape[1],
+                threads=torch.get_num_threads(),
+                count=count,
+                channels=channels,
+                rows=self.rows.data_ptr(),
+                smallest_share=SMALLEST_COMPLETENESS,
+                smallest_gap=SMALLEST_FRICTION_DISTANCE,
+                **arrays,
+            )
+        )
+
+
+def _compiled(wall: WallSample, *tensors: Tensor | None) -> _CompiledWalls | None:
     """Compiled passes for these arrays, or None: other device or type, no library, gradients wanted."""
-    if wall is None or wall.rows is None or wall.rows.device.type != "cpu":
+    if not isinstance(wall, CompleteWallSample) or wall.rows is None or wall.rows.device.type != "cpu":
         return None
     given = [t for t in (wall.rows, *tensors) if t is not None]
     if any(t.dtype != wall.rows.dtype for t in given):
         return None
     if torch.is_grad_enabled() and any(t.requires_grad for t in given):
         return None
-    return _code(wall.rows.dtype)
-
-
-def _arguments(wall: WallSample, vectors: Tensor, **arrays: int | float | None) -> ctypes._CArgObject:
-    count, channels = wall.rows.shape
-    return ctypes.byref(
-        WallArguments(
-            dimension=vectors.shape[1],
-            threads=torch.get_num_threads(),
-            count=count,
-            channels=channels,
-            rows=wall.rows.data_ptr(),
-            smallest_share=SMALLEST_SHARE,
-            smallest_gap=SMALLEST_FRICTION_DISTANCE,
-            **arrays,
-        )
-    )
+    code = _code(wall.rows.dtype)
+    return None if code is None else _CompiledWalls(code, wall.rows)

@@ -1,4 +1,4 @@
-"""Making the look-up fields of the walls: on a grid, at moments of the motion, for each set of open valves."""
+"""Making the look-up fields of the walls: on a grid, at key times of the motion, for each set of open valves."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from geometry import Grid, OrificePlane, Surface, WallMotion, grid_winding, orif
 from torchsph.pairs.smoothing_kernels import SmoothingKernel
 
 from .closest import closest_on_grid
-from .forces import WallSample
-from .kernel_share import KernelShare
-from .key_times import Moments
+from .completeness import KernelCompleteness
+from .interface import CompleteWallSample, WallSample
+from .key_times import KeyTimes
 from .look_up import LookUp, by_node
 
-# look-up spacing in particle spacings: half of it resolves the kernel's share to a percent (test_walls)
+# look-up spacing in particle spacings: half of it resolves the kernel's completeness to a percent (test_walls)
 _FIELD_SPACING = 0.5
 # distances outside the wall are exact this far (spacings): particles are put back long before
 _STRAY = 2.0
-# this far beyond the kernel's reach (spacings) the share is 1 and nothing else of the wall is asked for
+# this far beyond the kernel's reach (spacings) the kernel is complete and nothing else of the wall is asked for
 _FAR = 1.0
 # fields kept: the beat is run through in order, and a forecast of 40 ms spans about ten of them
 _KEPT = 24
@@ -30,15 +30,24 @@ _MEMORY = 1 << 29
 
 
 class WallFields:
-    """Distance, normal, wall velocity and (if asked) kernel share of moving walls with openings.
+    """Distance, normal, wall velocity and (if asked) kernel completeness of moving walls with openings.
+
+    A particle pays one interpolated look-up for all walls. The fields stand at key times of the walls' motion and are
+    linear in time between them (the two textures of Grønli 2017, sec. 3.1.3).
 
     Args:
-        motion: the walls (SI). spacing: particle spacing, m. speed: m/s per internal velocity.
-        kernel, smoothing_length: of the pair sums, internal length; the margin around the walls follows from them.
-        complete: whether the kernel's share and its gradient are wanted.
+        motion: the walls (SI).
+        spacing: particle spacing, m.
+        speed: m/s per internal velocity.
+        kernel: of the pair sums.
+        smoothing_length: internal; the margin around the walls follows from it and the kernel.
+        complete: whether the kernel's completeness and its gradient are wanted.
+        device: where the fields are read.
+        dtype: of the fields.
         sliding: whether what the walls sweep is wanted as well (``CompleteKernelWall.sliding``).
 
-    Raises geometry.SurfaceError for walls that are open or inside out.
+    Raises:
+        geometry.SurfaceError: the walls are open or inside out.
     """
 
     def __init__(
@@ -57,49 +66,54 @@ class WallFields:
         motion.surface(float(motion.time[0])).check()
         self.motion, self.spacing, self.speed = motion, spacing, speed
         self.device, self.dtype = device, dtype
-        self.moments = Moments(motion, spacing)
+        self.key_times = KeyTimes(motion, spacing)
         self.reach = kernel.support * smoothing_length  # internal
         self.grid = self._grid()
         self.dimension = self.grid.dimension
         self.complete, self.sliding = complete, sliding
-        self._share: KernelShare | None = None
+        self._completeness: KernelCompleteness | None = None
         if complete:
-            self._share = KernelShare(self.grid.shape, _FIELD_SPACING, kernel, smoothing_length, dtype)
+            self._completeness = KernelCompleteness(self.grid.shape, _FIELD_SPACING, kernel, smoothing_length, dtype)
         self._openings = orifices(motion)
         self._made: OrderedDict[tuple[int, tuple[int, ...]], Tensor] = OrderedDict()
 
     def _grid(self) -> Grid:
-        every = np.concatenate([self.motion.vertices(t) for t in self.moments.times])
+        every = np.concatenate([self.motion.vertices(t) for t in self.key_times.times])
         margin = (self.reach + 2.0) * self.spacing
         step = _FIELD_SPACING * self.spacing
         return Grid.covering(every.min(0) - margin, every.max(0) + margin, step)
 
-    def key(self, moment: int, open_regions: tuple[int, ...]) -> Tensor:
-        """Fields at a moment (a number of ``moments.times``) with some regions open: (C, *shape), internal units.
+    def key(self, number: int, open_regions: tuple[int, ...]) -> Tensor:
+        """Fields at a key time with some regions open.
 
-        Channels: distance, normal (D), wall velocity (D), with ``complete`` share, share gradient (D), with
-        ``sliding`` what the walls sweep.
+        Args:
+            number: of the key time in ``key_times.times``.
+            open_regions: regions of the walls that are no wall.
+
+        Returns:
+            (C, *shape), internal; channels: distance, normal (D), wall velocity (D), with ``complete`` completeness and
+            its gradient (D), with ``sliding`` what the walls sweep.
         """
-        label = (moment, open_regions)
+        label = (number, open_regions)
         if label in self._made:
             self._made.move_to_end(label)
             return self._made[label]
-        self._made[label] = made = self._make(moment, open_regions)
+        self._made[label] = made = self._make(number, open_regions)
         kept = max(_KEPT, _MEMORY // (made.numel() * made.element_size()))
         while len(self._made) > kept:
             self._made.popitem(last=False)
         return made
 
-    def _make(self, moment: int, open_regions: tuple[int, ...]) -> Tensor:
-        time = self.moments.times[moment]
+    def _make(self, number: int, open_regions: tuple[int, ...]) -> Tensor:
+        time = self.key_times.times[number]
         distance, velocity = self._distance(self.motion.surface(time), time, open_regions)
         d = torch.from_numpy(distance / self.spacing).to(self.dtype).reshape(self.grid.shape)
         carried = torch.from_numpy(velocity.T / self.speed).to(self.dtype).reshape(-1, *self.grid.shape)
         channels = [d[None], _normals(d), carried]
-        if self._share is not None:
-            channels.extend(self._share.at(d))
+        if self._completeness is not None:
+            channels.extend(self._completeness.at(d))
             if self.sliding:
-                channels.append(self._share.swept(d, (carried * channels[1]).sum(0), channels[1]))
+                channels.append(self._completeness.swept(d, (carried * channels[1]).sum(0), channels[1]))
         return by_node(torch.cat(channels).to(self.device))
 
     def _distance(self, surface: Surface, time: float, open_regions: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
@@ -122,18 +136,25 @@ class WallFields:
         return distance, carried
 
     def between(self, first: Tensor, second: Tensor) -> LookUp:
-        """The fields of two key frames made ready for look-ups between them."""
+        """The fields of two key times made ready for look-ups between them."""
         return LookUp(self.grid, first, second, self.spacing, plain=self.reach + _FAR, directed=True)
 
     def sample(self, fields: LookUp, fraction: Tensor, position: Tensor) -> WallSample:
-        """Walls at positions (N, D), internal; ``fraction`` (N,) or () of the way from the first key frame."""
+        """Walls at particles.
+
+        Args:
+            fields: of the two key times around (``between``).
+            fraction: (N,) or (), of the time from the first key time to the second.
+            position: (N, D), internal.
+        """
         values = fields.at(position, fraction)
         d = self.dimension
-        sample = (values[:, 0], values[:, 1 : 1 + d], values[:, 1 + d : 1 + 2 * d])
+        distance, normal, velocity = values[:, 0], values[:, 1 : 1 + d], values[:, 1 + d : 1 + 2 * d]
         if not self.complete:
-            return WallSample(*sample)
+            return WallSample(distance, normal, velocity)
         swept = values[:, 2 + 3 * d] if self.sliding else None
-        return WallSample(*sample, values[:, 1 + 2 * d], values[:, 2 + 2 * d : 2 + 3 * d], swept, values)
+        completeness, gradient = values[:, 1 + 2 * d], values[:, 2 + 2 * d : 2 + 3 * d]
+        return CompleteWallSample(distance, normal, velocity, completeness, gradient, swept, values)
 
 
 def _open_channel(

@@ -1,4 +1,4 @@
-"""The moments at which fields of a moving wall are made: more of them than key frames, or fewer, by how it moves."""
+"""The times at which fields of a moving wall are made: more of them than key frames, or fewer, by how it moves."""
 
 from __future__ import annotations
 
@@ -9,36 +9,40 @@ import numpy as np
 
 from geometry import WallMotion
 
-# between two moments no vertex goes farther than this (spacings); the indicator of the fluid would smear else
-_LONGEST_WAY = 1.0
-# between two moments the wall's way may leave the straight line by this much (spacings) ...
+# between two key times no vertex goes farther than this (spacings); the indicator of the fluid would smear else
+_LONGEST_PATH = 1.0
+# between two key times the wall's path may leave the straight line by this much (spacings) ...
 _LARGEST_BEND = 0.02
-# ... where moments are put between key frames; key frames are left out only where it is far less than that, and the
+# ... where key times are put between key frames; key frames are left out only where it is far less than that, and the
 # velocity as near to linear, as a part of the fastest wall's
 _SPARED_BEND, _SPARED_VELOCITY = 0.01, 0.01
 _SAMPLES = 4
 
 
-class Moments:
+class KeyTimes:
     """Increasing times (s) between which a wall's fields may be taken as linear in time.
 
     Args:
-        motion: the wall. spacing: of the particles, m.
+        motion: the wall.
+        spacing: of the particles, m.
+
+    Attributes:
+        times: s, increasing.
     """
 
     def __init__(self, motion: WallMotion, spacing: float) -> None:
         self.motion = motion
-        self.times = [float(t) for t in motion.time]
+        self.times: list[float] = [float(t) for t in motion.time]
         if motion.moves:
             keys = _spared(motion, spacing)
             spans = zip(keys, keys[1:], strict=False)
-            inner = [t for early, late in spans for t in _between(motion, early, late, spacing)]
-            self.times = sorted([float(motion.time[k]) for k in keys] + inner)
+            added = [t for early, late in spans for t in _between(motion, early, late, spacing)]
+            self.times = sorted([float(motion.time[k]) for k in keys] + added)
 
     def bracket(self, time: float) -> tuple[int, int, float, float]:
-        """Numbers of the moments before and after ``time`` (s), and their times in the present period.
+        """Numbers of the key times before and after ``time`` (s), and these times in the present period.
 
-        Off the key frames of a motion without a period the first or the last two moments.
+        Off the key frames of a motion without a period the first or the last two key times.
         """
         if len(self.times) == 1:
             return 0, 0, time, time
@@ -47,7 +51,7 @@ class Moments:
         return late - 1, late, self.times[late - 1] + shift, self.times[late] + shift
 
     def within(self, start: float, stop: float) -> list[float]:
-        """The moments in [start, stop] (s), in every period."""
+        """The key times in [start, stop] (s), in every period."""
         if len(self.times) == 1:
             return []
         found = [t for t in self.times if start <= t <= stop]
@@ -72,7 +76,7 @@ class Moments:
 
 
 def _spared(motion: WallMotion, spacing: float) -> list[int]:
-    """Key frames that are needed: those between which the others lie on a straight way, passed at linear velocity."""
+    """Key frames that are needed: those between which the others lie on a straight path, passed at linear velocity."""
     fastest = float(np.linalg.norm(motion.rates_at_keys, axis=2).max())
     kept, last = [0], len(motion.time) - 1
     while kept[-1] < last:
@@ -87,7 +91,7 @@ def _spared(motion: WallMotion, spacing: float) -> list[int]:
 def _straight(motion: WallMotion, start: int, stop: int, spacing: float, fastest: float) -> bool:
     """Whether the key frames between two may be left out."""
     x, v, t = motion.vertices_at_keys, motion.rates_at_keys, motion.time
-    if np.linalg.norm(x[stop] - x[start], axis=1).max() > _LONGEST_WAY * spacing:
+    if np.linalg.norm(x[stop] - x[start], axis=1).max() > _LONGEST_PATH * spacing:
         return False
     part = ((t[start + 1 : stop] - t[start]) / (t[stop] - t[start]))[:, None, None]
     bend = np.abs(x[start + 1 : stop] - x[start] - part * (x[stop] - x[start])).max()
@@ -96,15 +100,15 @@ def _straight(motion: WallMotion, start: int, stop: int, spacing: float, fastest
 
 
 def _between(motion: WallMotion, start: int, stop: int, spacing: float) -> list[float]:
-    """Moments to put between two key frames that follow each other."""
+    """Key times to put between two key frames that follow each other."""
     if stop > start + 1:
         return []
     early, late = float(motion.time[start]), float(motion.time[stop])
     parts = np.arange(_SAMPLES + 1) / _SAMPLES
     places = np.stack([motion.vertices(early + part * (late - early)) for part in parts])
-    way = np.linalg.norm(np.diff(places, axis=0), axis=2).sum(0).max()
+    path = np.linalg.norm(np.diff(places, axis=0), axis=2).sum(0).max()
     straight = places[0] + parts[:, None, None] * (places[-1] - places[0])
     bend = np.linalg.norm(places - straight, axis=2).max()
     # cut in n, a curve leaves its chords by 1 / n^2 of what it leaves the whole one
-    count = math.ceil(max(way / (_LONGEST_WAY * spacing), math.sqrt(bend / (_LARGEST_BEND * spacing))) - 1e-9)
+    count = math.ceil(max(path / (_LONGEST_PATH * spacing), math.sqrt(bend / (_LARGEST_BEND * spacing))) - 1e-9)
     return [early + k / count * (late - early) for k in range(1, count)]

@@ -1,28 +1,31 @@
-"""Looking up several grid fields at many points, between two moments, in one pass over memory."""
+"""Looking up several grid fields at many points, between two times, in one pass over memory."""
 
 from __future__ import annotations
 
 import ctypes
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
 from geometry import Grid
-from torchsph.native.library import REALS, LibraryMissing, LookUpArguments, library
+from torchsph.native.library import REALS, LibraryMissing, library
+from torchsph.native.structures import LookUpArguments
 
 
 class LookUp:
-    """Fields at two moments on one grid, read together by multilinear interpolation in space and linear in time.
+    """Fields at two times on one grid, read together by multilinear interpolation in space and linear in time.
 
     The channels of a node lie side by side, so that a point reads whole rows: by compiled code where there is some
     and no derivative is asked for (16,800 points of a sphere, 11 channels, one core: 1 ms), else by torch (3 ms).
 
     Args:
-        grid: the nodes, two or more along each axis. early, late: (C, *shape) at the two moments; the same tensor where
-            nothing changes.
+        grid: the nodes, two or more along each axis.
+        early: (C, *shape), at the first of the two times.
+        late: (C, *shape), at the second; ``early`` itself where nothing changes.
         unit: length of one unit of the points, m.
-        plain: cells where the first channel exceeds this at every corner and moment need no interpolation: compiled
+        plain: cells where the first channel exceeds this at every corner and time need no interpolation: compiled
             code gives them the early values of their lowest corner, which costs a tenth. None: no such cells.
         directed: whether channels 1 to D are a direction, given with length 1.
     """
@@ -41,32 +44,39 @@ class LookUp:
         self._rows = [rows_of(field) for field in ([early] if self.steady else [early, late])]
         self._plain = None if plain is None or early.is_cuda else _cells_above(torch.minimum(early[0], late[0]), plain)
         self._function = _compiled_function(self._rows[0])
-        self._both: Tensor | None = None  # both moments side by side, for torch
+        self._both: Tensor | None = None  # both times side by side, for torch
         self._counts = grid.shape[::-1]
         self._origin = [value / unit for value in grid.origin]
         self._step = [value / unit for value in grid.spacing]
         self._place = [early.new_tensor(values) for values in (self._origin, self._step, [n - 2 for n in self._counts])]
 
     def at(self, points: Tensor, fraction: Tensor) -> Tensor:
-        """Values (N, C) at points (N, D), ``fraction`` (N,) or () of the way from early to late.
+        """Values at points.
 
         Beyond the grid its edge continues; a point that is not finite gets values that are not finite.
+
+        Args:
+            points: (N, D).
+            fraction: (N,) or (), of the time from early to late.
+
+        Returns:
+            (N, C).
         """
         derived = torch.is_grad_enabled() and any(t.requires_grad for t in (points, fraction, *self._rows))
         alike = points.device.type == "cpu" and points.dtype == self._rows[0].dtype
         if self._function is not None and alike and not derived:
-            return self._compiled(points, fraction)
+            return self._compiled(self._function, points, fraction)
         values = self._by_torch(points, fraction)
         if not self._directed:
             return values
         last = 1 + points.shape[1]
         return torch.cat([values[:, :1], functional.normalize(values[:, 1:last], dim=1), values[:, last:]], 1)
 
-    def _compiled(self, points: Tensor, fraction: Tensor) -> Tensor:
+    def _compiled(self, function: Callable[[object], int], points: Tensor, fraction: Tensor) -> Tensor:
         points, fraction = points.contiguous(), fraction.to(points.dtype).contiguous()
         out = points.new_empty((points.shape[0], self.channels))
         triple, dimension = ctypes.c_double * 3, points.shape[1]
-        self._function(
+        function(
             ctypes.byref(
                 LookUpArguments(
                     dimension=dimension,
@@ -102,22 +112,22 @@ class LookUp:
         for axis in range(1, points.shape[1]):
             strides.append(strides[-1] * self._counts[axis - 1])
             node = node + low[:, axis].to(torch.int64) * strides[axis]
-        value = self._along(points.shape[1] - 1, node, share, strides)
+        value = self._along(self._both, points.shape[1] - 1, node, share, strides)
         if self.steady:
             return value
         weight = fraction[:, None] if fraction.ndim else fraction
         return torch.lerp(value[:, : self.channels], value[:, self.channels :], weight)
 
-    def _along(self, axis: int, node: Tensor, share: Tensor, strides: list[int]) -> Tensor:
-        """Interpolate axes 0 to ``axis`` from the corner ``node`` (N,)."""
+    def _along(self, rows: Tensor, axis: int, node: Tensor, share: Tensor, strides: list[int]) -> Tensor:
+        """Interpolate ``rows`` (nodes, C) along axes 0 to ``axis`` from the corner ``node`` (N,)."""
         if axis < 0:
-            return self._both.index_select(0, node)
-        first = self._along(axis - 1, node, share, strides)
-        second = self._along(axis - 1, node + strides[axis], share, strides)
+            return rows.index_select(0, node)
+        first = self._along(rows, axis - 1, node, share, strides)
+        second = self._along(rows, axis - 1, node + strides[axis], share, strides)
         return torch.lerp(first, second, share[:, axis : axis + 1])
 
 
-def _compiled_function(rows: Tensor) -> ctypes._CFuncPtr | None:
+def _compiled_function(rows: Tensor) -> Callable[[object], int] | None:
     """Compiled look-up for rows of this type and place; None where there is none, and torch has to do."""
     if rows.device.type != "cpu" or rows.dtype not in REALS:
         return None

@@ -10,14 +10,14 @@ from torch import Tensor
 
 from torchsph.native.library import LibraryMissing, library
 
-from .compiled import CompiledBackend
-from .correlation import KernelShape
-from .reference import ReferenceBackend
+from .compiled import CompiledTracking
+from .correlation import KernelShape, Triple
+from .reference import ReferenceTracking
 
 NAMES = ("auto", "cpu", "reference")
 
 
-class Backend(Protocol):
+class TrackingBackend(Protocol):
     """Sums over images and over boxes of nodes; all per-axis numbers in array order z, y, x.
 
     Samples are finite, complex64 or complex128.
@@ -26,25 +26,44 @@ class Backend(Protocol):
     name: str
 
     def mean_power(self, images: Tensor) -> Tensor:
-        """Mean square (z, y, x) over ``images`` (T, z, y, x)."""
-        ...
+        """Mean square (z, y, x) over the images.
 
-    def arrange(
-        self, images: Tensor, margin: tuple[int, int, int], *, turns: bool
-    ) -> tuple[Tensor, Tensor, Tensor | None]:
-        """Images (T, z, y, x) side by side at every node, (Z, Y, X, T) with a rim of ``margin`` zero nodes.
-
-        Also (Z, Y, X): their mean power, and with ``turns`` their lag-one autocorrelation, the sum of each
-        sample's conjugate times the sample of the next image, over the root of the power.
+        Args:
+            images: (T, z, y, x), complex.
         """
         ...
 
-    def box_sums(self, field: Tensor, middle: Tensor, half: tuple[int, int, int]) -> Tensor:
-        """Sums (P,) of a real ``field`` (Z, Y, X) over the boxes of ``half`` widths around ``middle`` (P, 3)."""
+    def arrange(self, images: Tensor, margin: Triple, *, turns: bool) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Images side by side at every node, (Z, Y, X, T), with a rim of zero nodes, and what they are on average.
+
+        Args:
+            images: (T, z, y, x), complex.
+            margin: (3,), nodes of the rim.
+            turns: whether the autocorrelation is needed.
+
+        Returns:
+            The images; (Z, Y, X) their mean power; and with ``turns`` (Z, Y, X) their lag-one autocorrelation,
+            the sum of each sample's conjugate times the sample of the next image, over the root of the power.
+        """
         ...
 
-    def sums_around(self, field: Tensor, half: tuple[int, int, int]) -> Callable[[Tensor], Tensor]:
-        """Sums (P,) of a complex ``field`` (Z, Y, X), 0 outside, over boxes of ``half`` widths around nodes (P, 3)."""
+    def box_sums(self, field: Tensor, middle: Tensor, half: Triple) -> Tensor:
+        """Sums (P,) over boxes.
+
+        Args:
+            field: (Z, Y, X), real.
+            middle: (P, 3), nodes in the middle of the boxes, which lie inside the volume.
+            half: (3,), nodes, half widths of a box.
+        """
+        ...
+
+    def sums_around(self, field: Tensor, half: Triple) -> Callable[[Tensor], Tensor]:
+        """A function that gives the sums (P,) over the boxes around nodes (P, 3).
+
+        Args:
+            field: (Z, Y, X), complex; 0 outside.
+            half: (3,), nodes, half widths of a box.
+        """
         ...
 
     def correlate(
@@ -57,20 +76,25 @@ class Backend(Protocol):
         *,
         ramp: Tensor | None = None,
     ) -> Tensor:
-        """Normalised correlation (P, Lz, Ly, Lx), see :func:`torchsph.ultrasound.correlation.correlate`."""
+        """Normalised correlation (P, Lz, Ly, Lx), see :func:`torchsph.ultrasound.estimation.correlation.correlate`."""
         ...
 
 
-def backend(name: str = "auto", device: torch.device | str = "cpu") -> Backend:
-    """The backend called ``name``, "cpu" (compiled) or "reference" (torch); "auto": the first that is there.
+def choose_backend(name: str = "auto", device: torch.device | str = "cpu") -> TrackingBackend:
+    """The backend of a name.
 
-    Raises ValueError where the name is unknown, or "cpu" was asked for and cannot be used: nothing slower is
-    taken silently in its place.
+    Args:
+        name: "cpu" (compiled), "reference" (torch), or "auto": the first that is there.
+        device: of the packet.
+
+    Raises:
+        ValueError: where the name is unknown, or "cpu" was asked for and cannot be used: nothing slower is
+            taken silently in its place.
     """
     if name not in NAMES:
         raise ValueError(f"unknown tracking backend {name!r}; known: {', '.join(NAMES)}")
     if name == "reference":
-        return ReferenceBackend()
+        return ReferenceTracking()
     problem = None
     if torch.device(device).type != "cpu":
         problem = f"works on CPU tensors only, the packet is on '{device}'"
@@ -80,7 +104,7 @@ def backend(name: str = "auto", device: torch.device | str = "cpu") -> Backend:
         except LibraryMissing as missing:
             problem = str(missing)
     if problem is None:
-        return CompiledBackend()
+        return CompiledTracking()
     if name == "cpu":
         raise ValueError(f"tracking backend 'cpu' was asked for and cannot be used: {problem}")
-    return ReferenceBackend()
+    return ReferenceTracking()

@@ -1,14 +1,15 @@
 """Clutter filters: what separates blood from bright, slow tissue, along the images of a packet.
 
-Overview and the response of regression filters: Bjaerum, Torp & Kristoffersen, IEEE Trans. Ultrason.
-Ferroelectr. Freq. Control 49, 2002. All filters act on IQ samples (T, *shape) and keep only images that
-are free of transients.
+Overview and the response of regression filters: Bjaerum, Torp & Kristoffersen 2002. All filters act on IQ samples
+(T, *shape) and keep only images that are free of transients. A further one is a class that meets
+:class:`ClutterFilter` and an entry of ``CLUTTER_FILTERS``, by which options and tests find it.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import numpy as np
 import torch
@@ -19,10 +20,23 @@ IMAGES_AT_ONCE = 16  # that an FIR filter makes: more of them would multiply mos
 
 
 class ClutterFilter(Protocol):
-    """A filter over the images of a packet."""
+    """A filter over the images of a packet, which stops what does not move.
+
+    ``adaptive`` says whether what it removes depends on the data; else it is linear, and ``response`` and
+    ``noise_gain`` are exact.
+    """
+
+    adaptive: ClassVar[bool]
 
     def apply(self, iq: Tensor) -> Tensor:
-        """Filtered samples (T', *shape) of ``iq`` (T, *shape), T' <= T."""
+        """Filtered samples (T', *shape), T' <= T.
+
+        Args:
+            iq: (T, *shape), complex.
+
+        Raises:
+            ValueError: where the packet is too short for the filter.
+        """
         ...
 
     def noise_gain(self, images: int) -> float:
@@ -36,12 +50,18 @@ class ClutterFilter(Protocol):
 
 @dataclass(frozen=True)
 class FIRFilter:
-    """Linear-phase high-pass of ``taps`` (odd) coefficients with its cut-off at ``cutoff`` of half the PRF.
+    """Linear-phase high-pass.
 
     A windowed design does not reject still tissue: firwin(9, .12) passes -5.9 dB at zero frequency. The
     mean of the coefficients is therefore taken off, which is the least change that puts an exact null
     there; being symmetric, the response then starts with the square of the frequency.
+
+    Args:
+        taps: number of coefficients, odd.
+        cutoff: cut-off frequency, as a fraction of half the PRF.
     """
+
+    adaptive: ClassVar[bool] = False
 
     taps: int = 9
     cutoff: float = 0.12
@@ -53,7 +73,11 @@ class FIRFilter:
             raise ValueError(f"cutoff must lie in (0, 1) of half the PRF, got {self.cutoff!r}")
 
     def coefficients(self) -> np.ndarray:
-        """Coefficients (taps,), unit gain at half the PRF; ArithmeticError if their sum is not 0."""
+        """Coefficients (taps,), of unit gain at half the PRF.
+
+        Raises:
+            ArithmeticError: where their sum is not 0, so that still tissue would pass.
+        """
         design = firwin(self.taps, self.cutoff, pass_zero=False)
         design = design - design.mean()
         design /= abs(np.sum(design * (-1.0) ** np.arange(self.taps)))
@@ -62,6 +86,7 @@ class FIRFilter:
         return design
 
     def apply(self, iq: Tensor) -> Tensor:
+        """See :class:`ClutterFilter`."""
         if len(iq) < self.taps:
             raise ValueError(f"an FIR filter of {self.taps} taps needs as many images, the packet has {len(iq)}")
         valid, parts = len(iq) - self.taps + 1, torch.view_as_real(iq.resolve_conj()).reshape(len(iq), -1)
@@ -77,17 +102,24 @@ class FIRFilter:
         return torch.view_as_complex(filtered.view(valid, *iq.shape[1:], 2))
 
     def response(self, frequency: np.ndarray) -> np.ndarray:
-        """Power response at ``frequency`` in units of the PRF."""
+        """See :class:`ClutterFilter`."""
         phase = np.exp(-2j * np.pi * np.asarray(frequency)[:, None] * np.arange(self.taps))
         return np.abs(phase @ self.coefficients()) ** 2
 
     def noise_gain(self, images: int) -> float:
+        """See :class:`ClutterFilter`."""
         return float((self.coefficients() ** 2).sum())
 
 
 @dataclass(frozen=True)
 class PolynomialFilter:
-    """Removes from every sample's history its least-squares polynomial of ``order``; keeps all images."""
+    """Removes from every sample's history its least-squares polynomial; keeps all images.
+
+    Args:
+        order: of the polynomial; 0 removes the mean.
+    """
+
+    adaptive: ClassVar[bool] = False
 
     order: int = 3
 
@@ -102,22 +134,35 @@ class PolynomialFilter:
         return np.linalg.qr(np.vander(np.linspace(-1, 1, images), self.order + 1, increasing=True))[0]
 
     def apply(self, iq: Tensor) -> Tensor:
+        """See :class:`ClutterFilter`."""
         basis = torch.from_numpy(self._basis(len(iq))).to(iq)
         flat = iq.reshape(len(iq), -1)
         return (flat - basis @ (basis.T @ flat)).reshape(iq.shape)
 
     def response(self, frequency: np.ndarray, images: int = 16) -> np.ndarray:
-        """Mean power response over the packet at ``frequency`` in units of the PRF (Bjaerum 2002)."""
+        """Mean power response over the packet (Bjaerum, Torp & Kristoffersen 2002).
+
+        Args:
+            frequency: (n,), in units of the PRF.
+            images: of the packet.
+        """
         wave = np.exp(2j * np.pi * np.asarray(frequency)[:, None] * np.arange(images))
         return 1 - (np.abs(wave.conj() @ self._basis(images)) ** 2).sum(1) / images
 
     def noise_gain(self, images: int) -> float:
+        """See :class:`ClutterFilter`."""
         return 1 - (self.order + 1) / images
 
 
 @dataclass(frozen=True)
 class SVDFilter:
-    """Removes the ``rank`` strongest components of space-time (Demene et al., IEEE TMI 34, 2015)."""
+    """Removes the strongest components of space-time (Demene et al. 2015).
+
+    Args:
+        rank: how many of them.
+    """
+
+    adaptive: ClassVar[bool] = True
 
     rank: int = 2
 
@@ -126,6 +171,7 @@ class SVDFilter:
             raise ValueError(f"rank must be a whole number >= 1, got {self.rank!r}")
 
     def apply(self, iq: Tensor) -> Tensor:
+        """See :class:`ClutterFilter`."""
         if len(iq) <= self.rank:
             raise ValueError(f"removing {self.rank} components leaves nothing of {len(iq)} images")
         flat = iq.reshape(len(iq), -1)
@@ -135,8 +181,17 @@ class SVDFilter:
         return (flat - strongest @ (strongest.mH @ flat)).reshape(iq.shape)
 
     def noise_gain(self, images: int) -> float:
+        """See :class:`ClutterFilter`."""
         return 1 - self.rank / images
 
     def response(self, frequency: np.ndarray) -> np.ndarray:
         """Ones: what is removed depends on the data."""
         return np.ones(np.shape(frequency))
+
+
+CLUTTER_FILTERS: dict[str, Callable[[], ClutterFilter]] = {
+    "fir": FIRFilter,
+    "polynomial": PolynomialFilter,
+    "svd": SVDFilter,
+}
+"""Filters by the names that options give them."""

@@ -9,47 +9,12 @@ import torch
 from torch import Tensor
 
 from torchsph.native.library import REALS, library
+from torchsph.native.structures import BoxArguments, CorrelationArguments, ImageArguments
 
-from .correlation import KernelShape, check_apart
+from .correlation import KernelShape, Triple, check_apart, triple
 
-_pointer, _int, _long = ctypes.c_void_p, ctypes.c_int32, ctypes.c_int64
-_Triple = _long * 3
-
-
-class _Correlation(ctypes.Structure):
-    """sph_correlation of csrc/interface.h."""
-
-    _fields_ = [
-        ("threads", _int),
-        *((name, _long) for name in ("points", "images", "apart")),
-        *((name, _Triple) for name in ("shape", "half", "search")),
-        *((name, _pointer) for name in ("volume", "corner", "offset", "ramp", "rho")),
-    ]
-
-
-class _Images(ctypes.Structure):
-    """sph_images of csrc/interface.h."""
-
-    _fields_ = [
-        ("threads", _int),
-        ("images", _long),
-        *((name, _Triple) for name in ("shape", "margin")),
-        *((name, _pointer) for name in ("samples", "volume", "power", "turn")),
-    ]
-
-
-class _Boxes(ctypes.Structure):
-    """sph_boxes of csrc/interface.h."""
-
-    _fields_ = [
-        ("threads", _int),
-        *((name, _long) for name in ("points", "parts")),
-        *((name, _Triple) for name in ("shape", "reach")),
-        *((name, _pointer) for name in ("field", "middle", "out")),
-    ]
-
-
-_STRUCTURES = {"correlate": _Correlation, "arrange": _Images, "box_sums": _Boxes}
+_STRUCTURES = {"correlate": CorrelationArguments, "arrange": ImageArguments, "box_sums": BoxArguments}
+_Triple = ctypes.c_int64 * 3
 
 
 def _call(name: str, dtype: torch.dtype, **arguments: object) -> None:
@@ -63,13 +28,16 @@ def _call(name: str, dtype: torch.dtype, **arguments: object) -> None:
     function(ctypes.byref(_STRUCTURES[name](threads=torch.get_num_threads(), **plain)))
 
 
-class CompiledBackend:
-    """See :class:`~torchsph.ultrasound.backends.Backend`. As many threads as torch uses; their number changes
-    nothing in the results."""
+class CompiledTracking:
+    """The sums by compiled code, see :class:`~torchsph.ultrasound.estimation.backends.TrackingBackend`.
+
+    As many threads as torch uses; their number changes nothing in the results.
+    """
 
     name = "cpu"
 
     def mean_power(self, images: Tensor) -> Tensor:
+        """See :class:`~torchsph.ultrasound.estimation.backends.TrackingBackend`."""
         images = images.resolve_conj().contiguous()
         power = images.real.new_empty(images.shape[1:])
         _call(
@@ -85,9 +53,8 @@ class CompiledBackend:
         )
         return power
 
-    def arrange(
-        self, images: Tensor, margin: tuple[int, int, int], *, turns: bool
-    ) -> tuple[Tensor, Tensor, Tensor | None]:
+    def arrange(self, images: Tensor, margin: Triple, *, turns: bool) -> tuple[Tensor, Tensor, Tensor | None]:
+        """See :class:`~torchsph.ultrasound.estimation.backends.TrackingBackend`."""
         images, shape = images.resolve_conj().contiguous(), tuple(images.shape[1:])
         whole = tuple(n + 2 * m for n, m in zip(shape, margin, strict=True))
         volume, power = images.new_empty((*whole, len(images))), images.real.new_empty(whole)
@@ -105,10 +72,12 @@ class CompiledBackend:
         )
         return volume, power, turn
 
-    def box_sums(self, field: Tensor, middle: Tensor, half: tuple[int, int, int]) -> Tensor:
+    def box_sums(self, field: Tensor, middle: Tensor, half: Triple) -> Tensor:
+        """See :class:`~torchsph.ultrasound.estimation.backends.TrackingBackend`."""
         return _box_sums(field.contiguous(), _nodes(middle, field.shape, half), half)
 
-    def sums_around(self, field: Tensor, half: tuple[int, int, int]) -> Callable[[Tensor], Tensor]:
+    def sums_around(self, field: Tensor, half: Triple) -> Callable[[Tensor], Tensor]:
+        """See :class:`~torchsph.ultrasound.estimation.backends.TrackingBackend`."""
         return lambda middle: _box_sums(field, _nodes(middle, field.shape), half)
 
     def correlate(
@@ -121,9 +90,10 @@ class CompiledBackend:
         *,
         ramp: Tensor | None = None,
     ) -> Tensor:
+        """See :class:`~torchsph.ultrasound.estimation.backends.TrackingBackend`."""
         images, half = volume.shape[-1], corner.new_tensor(shape.half)
         check_apart(apart, images)
-        reach = tuple(h + s for h, s in zip(shape.half, shape.search, strict=True))
+        reach = triple(h + s for h, s in zip(shape.half, shape.search, strict=True))
         corner, offset = corner.contiguous(), offset.contiguous()
         _nodes(corner + half, volume.shape, shape.half)
         _nodes(corner + half + offset, volume.shape, reach)
@@ -146,7 +116,7 @@ class CompiledBackend:
         return rho
 
 
-def _box_sums(field: Tensor, nodes: Tensor, half: tuple[int, int, int]) -> Tensor:
+def _box_sums(field: Tensor, nodes: Tensor, half: Triple) -> Tensor:
     """Sums (P,) over the parts inside the volume of the boxes around ``nodes`` (P, 3)."""
     sums = field.new_empty(len(nodes))
     _call(
@@ -163,7 +133,7 @@ def _box_sums(field: Tensor, nodes: Tensor, half: tuple[int, int, int]) -> Tenso
     return sums
 
 
-def _nodes(middle: Tensor, shape: torch.Size, reach: tuple[int, int, int] = (0, 0, 0)) -> Tensor:
+def _nodes(middle: Tensor, shape: torch.Size, reach: Triple = (0, 0, 0)) -> Tensor:
     """``middle`` (P, 3), contiguous; IndexError where a box of ``reach`` around one leaves the volume."""
     if len(middle):
         lowest, highest = middle.amin(0).tolist(), middle.amax(0).tolist()

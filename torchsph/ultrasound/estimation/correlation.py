@@ -9,6 +9,7 @@ middle axis its diagonals. This is what the compiled sums of ``csrc/correlation.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import torch
@@ -19,25 +20,41 @@ from .box_sums import power
 
 REGION_BYTES = 8 << 20  # of what is searched, gathered at a time: it bounds memory and stays in a CPU's cache
 
+Triple = tuple[int, int, int]  # one whole number for each array axis z, y, x
+
+
+def triple(numbers: Iterable[int]) -> Triple:
+    """Three whole numbers, one for each array axis; ValueError where there are not three."""
+    z, y, x = numbers
+    return z, y, x
+
 
 @dataclass(frozen=True)
 class KernelShape:
-    """Half widths of a kernel and of the lags searched, both per array axis (z, y, x), in nodes."""
+    """Kernels and the lags that are searched, in nodes.
 
-    half: tuple[int, int, int]
-    search: tuple[int, int, int]
+    Args:
+        half: (3,), half widths of a kernel.
+        search: (3,), greatest lags.
+    """
 
-    @property
-    def size(self) -> tuple[int, int, int]:
-        return tuple(2 * h + 1 for h in self.half)
-
-    @property
-    def lags(self) -> tuple[int, int, int]:
-        return tuple(2 * s + 1 for s in self.search)
+    half: Triple
+    search: Triple
 
     @property
-    def region(self) -> tuple[int, int, int]:
-        return tuple(2 * (h + s) + 1 for h, s in zip(self.half, self.search, strict=True))
+    def size(self) -> Triple:
+        """Nodes (3,) of a kernel."""
+        return triple(2 * h + 1 for h in self.half)
+
+    @property
+    def lags(self) -> Triple:
+        """How many lags (3,) are searched."""
+        return triple(2 * s + 1 for s in self.search)
+
+    @property
+    def region(self) -> Triple:
+        """Nodes (3,) that a kernel covers at all its lags together."""
+        return triple(2 * (h + s) + 1 for h, s in zip(self.half, self.search, strict=True))
 
 
 def check_apart(apart: int, images: int) -> None:
@@ -46,12 +63,16 @@ def check_apart(apart: int, images: int) -> None:
         raise ValueError(f"images {apart} apart cannot be compared in a packet of {images}")
 
 
-def gather(volume: Tensor, corner: Tensor, size: tuple[int, int, int], *, early: int = 0) -> Tensor:
-    """Blocks (P, sz, sy, sx * T) of a contiguous ``volume`` (Z, Y, X, T) with first nodes ``corner`` (P, 3).
+def gather(volume: Tensor, corner: Tensor, size: Triple, *, early: int = 0) -> Tensor:
+    """Blocks (P, sz, sy, sx * T) of a volume; whole lines of nodes and images are copied at once.
 
-    Whole lines of nodes and images are copied at once. They are read ``early`` samples early: image t then
-    stands in the place of image t + early, and the first ``early`` places of each node hold no image of its
-    own. No corner may then be the very first node.
+    Args:
+        volume: (Z, Y, X, T), contiguous.
+        corner: (P, 3), first nodes of the blocks.
+        size: (3,), nodes of a block.
+        early: samples by which lines are read early: image t then stands in the place of image t + early, and
+            the first ``early`` places of each node hold no image of its own. No corner may then be the very
+            first node.
     """
     depth, height, width, images = volume.shape
     skipped = 1 if early else 0
@@ -72,16 +93,21 @@ def correlate(
 ) -> Tensor:
     """Normalised complex correlation (P, Lz, Ly, Lx), pooled over all pairs of images ``apart`` images apart.
 
-    ``volume`` (Z, Y, X, T), contiguous, with a node to spare around every kernel and lag, T > apart;
-    ``corner`` (P, 3): first node of each kernel; ``offset`` (P, 3): lag in the middle of the search, nodes.
     With a(t, k) the kernel and b(t + apart, k + s) what lies at lag s,
 
         rho(s) = sum conj(a) b / sqrt(sum |a|^2 sum |b|^2),  sums over t and k,
 
     so |rho| <= 1. Zero where either has no energy.
-    ``ramp`` (P, 3), rad per node and image: how the echoes' turn between images changes along each axis; a
-    kernel's nodes are turned back to its middle by it, so that axial shear does not make their products
-    cancel.
+
+    Args:
+        volume: (Z, Y, X, T), contiguous, with a node to spare around every kernel and lag, T > apart.
+        apart: images between those compared.
+        corner: (P, 3), first node of each kernel.
+        offset: (P, 3), nodes, lag in the middle of the search.
+        shape: of kernels and search.
+        ramp: (P, 3), rad per node and image, how the echoes' turn between images changes along each axis; a
+            kernel's nodes are turned back to its middle by it, so that axial shear does not make their products
+            cancel.
     """
     check_apart(apart, volume.shape[-1])
     each = math.prod(shape.region) * volume.shape[-1] * volume.element_size()

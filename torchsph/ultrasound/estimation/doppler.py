@@ -1,6 +1,6 @@
 """Doppler: the velocity along the beam from the phase between images, and full vectors from several beams.
 
-The lag-one autocorrelation of Kasai et al. (IEEE Trans. Sonics Ultrason. 32, 1985). Speeds beyond
+The lag-one autocorrelation of Kasai et al. 1985. Speeds beyond
 :attr:`Acquisition.aliasing_speed` wrap around, as on every scanner.
 """
 
@@ -12,15 +12,20 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from ..scanner.acquisition import Packet
+from ..acquisition import Packet
 from .box_sums import box_sum
 from .clutter import ClutterFilter, FIRFilter
 
 
 @dataclass(frozen=True)
 class ColourDoppler:
-    """Autocorrelation over a window: side ``window`` m, ``clutter`` filter (``None`` = already filtered),
-    ``min_snr`` dB over the packet's noise after the filter (``None`` = no gate)."""
+    """Options of :func:`colour_doppler`, the autocorrelation over a window.
+
+    Args:
+        window: m, its side on every axis.
+        clutter: filter over the packet; ``None`` = already filtered.
+        min_snr: dB, least power over the packet's noise after the filter; ``None`` = no gate.
+    """
 
     window: float = 1e-3
     clutter: ClutterFilter | None = field(default_factory=FIRFilter)
@@ -33,8 +38,14 @@ class ColourDoppler:
 
 @dataclass(frozen=True, eq=False)
 class DopplerEstimates:
-    """Of n points: ``speed`` along the beam, positive away from the probe, and its deviation ``sigma``, m/s;
-    ``coherence`` |R(1)| / R(0) in [0, 1]; ``accepted`` bool."""
+    """What Doppler says of each of n points.
+
+    Args:
+        speed: (n,), m/s, along the beam, positive away from the probe.
+        sigma: (n,), m/s, its standard deviation.
+        coherence: (n,), |R(1)| / R(0), in [0, 1].
+        accepted: (n,), bool.
+    """
 
     speed: Tensor
     sigma: Tensor
@@ -43,14 +54,22 @@ class DopplerEstimates:
 
 
 def colour_doppler(packet: Packet, points: Tensor, options: ColourDoppler) -> DopplerEstimates:
-    """Axial velocities at the image nodes nearest to ``points`` (n, D), m.
+    """Axial velocities at the image nodes nearest to some points.
 
     With R(k) the sum of conj(I(t)) I(t + k) over images and window, speed = -arg R(1) c PRF / (4 pi f), and
 
         sigma^2 = (1 - coherence^2) / (2 N coherence^2) (c PRF / (4 pi f))^2
 
     with N pairs of images: the Cramer-Rao bound for one speckle per window, larger than the error if it holds
-    several. Raises ValueError where the clutter filter leaves fewer than two images or points lie outside.
+    several.
+
+    Args:
+        packet: IQ images.
+        points: (n, D), m, inside the image.
+        options: window, filter and gate.
+
+    Raises:
+        ValueError: where the clutter filter leaves fewer than two images or points lie outside.
     """
     finite = torch.isfinite(torch.view_as_real(packet.iq)).all(-1).all(0)
     clean = torch.where(finite, packet.iq, 0)
@@ -67,7 +86,7 @@ def colour_doppler(packet: Packet, points: Tensor, options: ColourDoppler) -> Do
     for number, step in enumerate(packet.grid.spacing):
         nodes = 2 * round(options.window / (2 * step)) + 1
         sums = box_sum(sums, nodes, sums.dim() - 1 - number)
-    real, imaginary, power, count = sums[(slice(None), *place.unbind(1))]
+    real, imaginary, power, count = (part[place.unbind(1)] for part in sums)
     coherence = (torch.hypot(real, imaginary) / power.clamp_min(torch.finfo(power.dtype).tiny)).clamp(0, 1)
     per_radian = packet.acquisition.prf / packet.acquisition.phase_per_metre
     pairs = len(filtered) - 1
@@ -83,10 +102,15 @@ def colour_doppler(packet: Packet, points: Tensor, options: ColourDoppler) -> Do
 
 
 def vector_doppler(beams: Tensor, speeds: Tensor, sigmas: Tensor) -> tuple[Tensor, Tensor]:
-    """Least-squares velocities (n, D) and deviations (n, D) from speeds (m, n) along unit ``beams`` (m, D).
+    """Least-squares velocities (n, D) and their deviations (n, D), m/s, from speeds along several beams.
 
-    Each speed is weighted by its own ``sigmas`` (m, n). Raises ValueError where the beams do not span the
-    space.
+    Args:
+        beams: (m, D), unit vectors.
+        speeds: (m, n), m/s, along them.
+        sigmas: (m, n), m/s, their standard deviations, by which they are weighted.
+
+    Raises:
+        ValueError: where the beams do not span the space.
     """
     if torch.linalg.matrix_rank(beams.double(), rtol=1e-3) < beams.shape[1]:
         raise ValueError(f"{len(beams)} beams do not span {beams.shape[1]} dimensions; steer more of them")

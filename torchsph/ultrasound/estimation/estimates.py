@@ -33,15 +33,21 @@ def bit(condition: Tensor, flag: Flag) -> Tensor:
 class Estimates:
     """What a tracker says of each of n points; components in the order x, y, z.
 
-    velocity (n, D) m/s. correlation (n,) of the accepted lag, in [0, 1]. peak_ratio (n,): highest peak of the
-    search over the second. curvature (n, D): -(second derivative of log |rho|) per axis, 1/m^2. variance
-    (n, D): (m/s)^2 up to a constant, what correlation and curvature say of the precision; calibration makes a
-    ``sigma`` of it. power (n,): share of the unfiltered power that passed the clutter filter, dB. snr
-    (n,): power over thermal noise after the filter, dB (NaN if the noise is unknown). response (n,): of the
-    clutter filter at the Doppler frequency of the velocity, dB. shear (n,): size of the axial velocity's
-    gradient, 1/s, and bend (n,): how far half a kernel further on it is off a straight line, m/s (both NaN if not
-    looked for). lag (n,): images between those compared. flags (n,):
-    :class:`Flag` bits, 0 = accepted.
+    Args:
+        velocity: (n, D), m/s.
+        correlation: (n,), of the accepted lag, in [0, 1].
+        peak_ratio: (n,), highest peak of the search over the second.
+        curvature: (n, D), 1/m^2, -(second derivative of log |rho|) along each axis.
+        variance: (n, D), (m/s)^2 up to a constant, what correlation and curvature say of the precision;
+            calibration makes a ``sigma`` of it.
+        power: (n,), dB, share of the unfiltered power that passed the clutter filter.
+        snr: (n,), dB, power over thermal noise after the filter; NaN if the noise is unknown.
+        response: (n,), dB, of the clutter filter at the Doppler frequency of the velocity.
+        shear: (n,), 1/s, size of the axial velocity's gradient; NaN if not looked for.
+        bend: (n,), m/s, how far the axial velocity half a kernel further on is off a straight line; NaN if not
+            looked for.
+        lag: (n,), images between those compared.
+        flags: (n,), :class:`Flag` bits, 0 = accepted.
     """
 
     velocity: Tensor

@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from ..scanner.acquisition import decibel
+from ..acquisition import decibel
 from .estimates import Flag, bit
 from .prepared import Prepared
 
@@ -23,7 +23,15 @@ def gates(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Power over noise (dB), share of power passed (dB) and the flags that need no correlation, each (P,).
 
-    ``nodes`` (P, 3): in the middle of the kernels. See :class:`SpeckleTracker` for the thresholds.
+    See :class:`SpeckleTracker` for the thresholds.
+
+    Args:
+        images: the packet, prepared.
+        nodes: (P, 3), in the middle of the kernels.
+        min_samples: nodes per axis that a kernel needs.
+        min_blood: dB, least share of the power that passes the clutter filter, or ``None``.
+        min_snr: dB, least power over noise, or ``None``.
+        max_snr: dB, greatest power over noise, or ``None``.
     """
     covered = images.covered(nodes)
     count = covered.prod(1).clamp_min(1)

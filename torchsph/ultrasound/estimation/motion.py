@@ -15,11 +15,17 @@ from .prepared import Prepared
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """Motion of P kernels, all in array order z, y, x.
+    """Motion of P kernels, all in array order z, y, x; see :class:`Estimates` for what is said of its precision.
 
-    shift (P, 3): m per image. correlation (P,): |rho| at the peak. peak_ratio (P,), curvature (P, 3), variance
-    (P, 3) in m^2 per image squared, lag (P,): see :class:`Estimates`. sound (P,): whether there is a peak. gap
-    (P,): by how many turns of the phase the peak of the wide search is off along the beam, 0 to 0.5.
+    Args:
+        shift: (P, 3), m per image.
+        correlation: (P,), |rho| at the peak.
+        peak_ratio: (P,), highest peak of the wide search over the second.
+        curvature: (P, 3), 1/m^2.
+        variance: (P, 3), m^2 per image squared, up to a constant.
+        lag: (P,), images between those compared.
+        sound: (P,), bool, whether there is a peak.
+        gap: (P,), by how many turns of the phase the peak of the wide search is off along the beam, 0 to 0.5.
     """
 
     shift: Tensor
@@ -32,7 +38,12 @@ class Motion:
     gap: Tensor
 
     def better(self, other: Motion, allowed: Tensor) -> Motion:
-        """Takes ``other`` where allowed (P,), sound and promising a smaller total variance."""
+        """The other motion where that is allowed, sound and promises a smaller total variance; else this one.
+
+        Args:
+            other: of the same kernels.
+            allowed: (P,), bool.
+        """
         take = allowed & other.sound & (~self.sound | (other.variance.sum(1) < self.variance.sum(1)))
         picked = {}
         for name in (field.name for field in fields(self)):
@@ -55,11 +66,19 @@ def find_motion(
     prior: Motion | None,
     phase: bool,
 ) -> Motion:
-    """Motion between images ``lag`` images apart of kernels with first nodes ``corner`` (P, 3), searched
-    around ``offset`` (P, 3), nodes.
+    """Motion between images a lag apart.
 
-    With ``phase`` the axial component is that of the correlation's phase, the whole turns of which are told
-    by ``prior`` or else by the peak itself. ``beam`` (P, 3): unit vectors. ``ramp``: see :func:`correlate`.
+    Args:
+        images: the packet, prepared.
+        lag: images between those compared.
+        corner: (P, 3), first nodes of the kernels.
+        offset: (P, 3), nodes, around which motion is searched.
+        shape: of kernels and search.
+        beam: (P, 3), unit vectors along the beams.
+        ramp: (P, 3), rad per node and image, see :func:`correlate`.
+        prior: what is known of the motion, which then tells the whole turns of the phase; ``None`` = the peak
+            itself tells them.
+        phase: whether the axial component is that of the correlation's phase.
     """
     rho = images.backend.correlate(images.volume, lag, corner, offset, shape, ramp=ramp)
     active = list(images.active)
@@ -106,7 +125,7 @@ def _precision(peak: Peak, spacing: Tensor, along: Tensor, phase_per_metre: floa
     """Variance of the shift per axis, m^2, up to a constant, and relative curvature, 1/m^2, both (P, D).
 
     The variance of a correlation peak is that of the noise, 1 - rho^2, over its curvature (as in the
-    Cramer-Rao bound of Walker & Trahey, IEEE UFFC 42, 1995); of the axial component, over the square of
+    Cramer-Rao bound of Walker & Trahey 1995); of the axial component, over the square of
     the carrier if the phase is used.
     """
     relative = -peak.hessian / torch.outer(spacing, spacing)

@@ -21,10 +21,13 @@ FIT_WEIGHTS = (1.0, 1.0, 0.1, 0.01)  # of nodes 0 to 3 steps off the middle
 class Peak:
     """A correlation peak of each point; lags in nodes, in the order of the array's axes.
 
-    lag (P, A): of the vertex, from the middle of the search. hessian (P, A, A) of log |rho|, per node
-    squared. value (P,): complex rho at the vertex, |value| <= 1. ratio (P,): of the highest magnitude to the
-    highest other local maximum, or to the lowest value where there is none. concave (P,): whether the
-    paraboloid has a maximum.
+    Args:
+        lag: (P, A), nodes, of the vertex, from the middle of the search.
+        hessian: (P, A, A), per node squared, of log |rho|.
+        value: (P,), complex rho at the vertex, |value| <= 1.
+        ratio: (P,), of the highest magnitude to the highest other local maximum, or to the lowest value where
+            there is none.
+        concave: (P,), bool, whether the paraboloid has a maximum.
     """
 
     lag: Tensor
@@ -38,6 +41,10 @@ class Peak:
 
         With an axial lag known better (from the phase), the lateral ones follow it along the paraboloid's
         ridge.
+
+        Args:
+            direction: (P, A).
+            along: (P,).
         """
         tilt = torch.linalg.solve(self.hessian, direction[..., None])[..., 0]
         gap = along - (self.lag * direction).sum(-1)
@@ -45,10 +52,13 @@ class Peak:
 
 
 def find_peak(rho: Tensor) -> Peak:
-    """The peak of |rho|, complex (P, L1, ..., LA) with three or more (odd) lags on every axis.
+    """The peak of |rho|.
 
     At the rim of the search the paraboloid is fitted one node further in and may be followed outwards by
     up to a node and a half: a peak beyond the rim shows as a lag beyond it.
+
+    Args:
+        rho: (P, L1, ..., LA), complex, with three or more (odd) lags on every axis.
     """
     lags = rho.shape[1:]
     magnitude = rho.abs()

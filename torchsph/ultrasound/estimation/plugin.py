@@ -1,8 +1,7 @@
 """Other trackers in the place of ours: the interface they meet, and a way to call one that is a C library.
 
-The thesis calls its laboratory's tracker through ctypes with a C struct of parameters (its section 3.3).
-The same contract, spelt out (doubles in SI units, x before y before z, row-major arrays, IQ interleaved
-real, imaginary):
+Grønli 2017, sec. 3.3 calls the laboratory's tracker through ctypes with a C struct of parameters. The same
+contract, spelt out (doubles in SI units, x before y before z, row-major arrays, IQ interleaved real, imaginary):
 
     typedef struct {
         int32_t dimension, images, nz, ny, nx;       // nz = 1 in a plane, whose second axis is y
@@ -21,6 +20,7 @@ It returns 0, or a code of its own that is passed on in the error. NaN velocitie
 from __future__ import annotations
 
 import ctypes
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -28,7 +28,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from ..scanner.acquisition import Packet
+from ..acquisition import Packet
 from .clutter import ClutterFilter
 from .estimates import Estimates, Flag
 
@@ -37,7 +37,12 @@ class Tracker(Protocol):
     """Anything that finds velocities in a packet of IQ images."""
 
     def track(self, packet: Packet, points: Tensor) -> Estimates:
-        """Estimates at ``points`` (n, D), m."""
+        """Estimates at some points.
+
+        Args:
+            packet: IQ images.
+            points: (n, D), m, inside the image.
+        """
         ...
 
 
@@ -54,8 +59,12 @@ class _Parameters(ctypes.Structure):
 class LibraryTracker:
     """A tracker in a shared library, see the module's text. Parallel beams only.
 
-    path: of the library. kernel, search: passed on. clutter: filter applied here first, ``None`` if the
-    library has its own. min_correlation: estimates below are flagged.
+    Args:
+        path: of the library.
+        kernel: m, side of the kernel, passed on.
+        search: m/s, greatest speed per component, passed on.
+        clutter: filter applied here first; ``None`` = the library has its own.
+        min_correlation: estimates below are flagged.
     """
 
     path: str | Path
@@ -69,7 +78,7 @@ class LibraryTracker:
             raise FileNotFoundError(f"no tracking library at {self.path}")
         self._function()
 
-    def _function(self) -> ctypes._CFuncPtr:
+    def _function(self) -> Callable[..., int]:
         try:
             function = ctypes.CDLL(str(Path(self.path).resolve())).speckle_track
         except OSError as error:
@@ -82,7 +91,16 @@ class LibraryTracker:
         return function
 
     def track(self, packet: Packet, points: Tensor) -> Estimates:
-        """Estimates at ``points`` (n, D), m. Raises RuntimeError with the library's code where it fails."""
+        """Estimates at some points; see :class:`Tracker`.
+
+        Args:
+            packet: IQ images.
+            points: (n, D), m, inside the image.
+
+        Raises:
+            RuntimeError: with the library's code where it fails.
+            ValueError: where the beams come from an apex.
+        """
         if packet.beams.apex is not None:
             raise ValueError("the library's interface knows parallel beams only")
         iq = packet.iq if self.clutter is None else self.clutter.apply(packet.iq)

@@ -10,22 +10,33 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ..scanner.acquisition import Packet
-from .backends import Backend
+from ..acquisition import Packet
+from .backends import TrackingBackend
 from .clutter import ClutterFilter
-from .correlation import KernelShape
+from .correlation import KernelShape, Triple, triple
 
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
     """Filtered images, padded so that every block of nodes fits; all per-axis numbers in array order z, y, x.
 
-    A plane has a z axis of one node. volume (Z, Y, X, T); raw_power, power (Z, Y, X): mean squares over the
-    images before and after the filter; spoilt (Z, Y, X): 1 where an image is not finite, ``None`` = nowhere.
-    margin: nodes of padding. spacing (3,): m, 1 along an axis that is not there. noise: power of the thermal
-    noise after the filter, if known. turn, wide_turn: of the echoes from image to image, complex, averaged over a
-    kernel and over twice a kernel around nodes (P, 3) of the padded volume, ``None`` = not asked for. active: the
-    axes that are there. backend: who does the sums.
+    A plane has a z axis of one node.
+
+    Args:
+        packet: what was prepared.
+        shape: of kernels and search.
+        volume: (Z, Y, X, T), the filtered images.
+        raw_power: (Z, Y, X), mean square over the images before the filter.
+        power: (Z, Y, X), mean square over the images after it.
+        spoilt: (Z, Y, X), 1 where an image is not finite; ``None`` = nowhere.
+        margin: (3,), nodes of padding.
+        spacing: (3,), m, 1 along an axis that is not there.
+        noise: power of the thermal noise after the filter, if known.
+        turn: of the echoes from image to image, complex (P,), averaged over a kernel around nodes (P, 3) of the
+            padded volume; ``None`` = not asked for.
+        wide_turn: the same, averaged over twice a kernel.
+        active: the axes that are there.
+        backend: who does the sums.
     """
 
     packet: Packet
@@ -34,18 +45,18 @@ class Prepared:
     raw_power: Tensor
     power: Tensor
     spoilt: Tensor | None
-    margin: tuple[int, int, int]
+    margin: Triple
     spacing: Tensor
     noise: float | None
     turn: Callable[[Tensor], Tensor] | None
     wide_turn: Callable[[Tensor], Tensor] | None
     active: tuple[int, ...]
-    backend: Backend
+    backend: TrackingBackend
 
     @property
-    def nodes(self) -> tuple[int, int, int]:
+    def nodes(self) -> Triple:
         """Nodes per axis of the image without its padding."""
-        return tuple(n - 2 * m for n, m in zip(self.power.shape, self.margin, strict=True))
+        return triple(n - 2 * m for n, m in zip(self.power.shape, self.margin, strict=True))
 
     def middle(self, nodes: Tensor) -> Tensor:
         """Nodes (P, 3) of the padded volume that are ``nodes`` (P, 3) of the image."""
@@ -56,7 +67,12 @@ class Prepared:
         return self.middle(nodes) - nodes.new_tensor(self.shape.half)
 
     def kernel_sums(self, field: Tensor, nodes: Tensor) -> Tensor:
-        """Sums (P,) of ``field`` (Z, Y, X) over the kernels around ``nodes`` (P, 3)."""
+        """Sums (P,) over kernels.
+
+        Args:
+            field: (Z, Y, X), padded.
+            nodes: (P, 3), of the image, in the middle of the kernels.
+        """
         return self.backend.box_sums(field, self.middle(nodes), self.shape.half)
 
     def covered(self, nodes: Tensor) -> Tensor:
@@ -67,11 +83,11 @@ class Prepared:
     def ramp(self, nodes: Tensor) -> Tensor | None:
         """Gradient (P, 3), rad per node and image, of how much echoes turn, at ``nodes`` (P, 3).
 
-        The turn is the phase of the lag-one autocorrelation (Kasai et al., IEEE Trans. Sonics Ultrason. 32,
-        1985), averaged over twice the kernel: with few numbers taken from the data, little of the speckle's own
-        phase gets into them. Nodes weigh by amplitude instead of power, so that neither the brightest speckle nor
-        what is left of a wall nearby speaks for all. Its change is that to half a kernel further on, either side;
-        from node to node it would be that of single speckles, whose nodes turn together whatever the shear.
+        The turn is the phase of the lag-one autocorrelation (Kasai et al. 1985), averaged over twice the kernel: with
+        few numbers taken from the data, little of the speckle's own phase gets into them. Nodes weigh by amplitude
+        instead of power, so that neither the brightest speckle nor what is left of a wall nearby speaks for all. Its
+        change is that to half a kernel further on, either side; from node to node it would be that of single speckles,
+        whose nodes turn together whatever the shear.
         """
         if self.wide_turn is None:
             return None
@@ -83,15 +99,20 @@ class Prepared:
     def _changes(self, turn: Callable[[Tensor], Tensor], nodes: Tensor) -> dict[int, tuple[Tensor, Tensor]]:
         """By axis, how ``turn`` changes from half a kernel before to ``nodes`` (P, 3), and from there on; complex."""
         middle = self.middle(nodes)
-        here, changes = turn(middle), {}
+        in_middle, changes = turn(middle), {}
         for axis in self.active:
             step = torch.zeros_like(middle)
             step[:, axis] = self.shape.half[axis]
-            changes[axis] = turn(middle - step).conj() * here, here.conj() * turn(middle + step)
+            changes[axis] = turn(middle - step).conj() * in_middle, in_middle.conj() * turn(middle + step)
         return changes
 
     def shear(self, ramp: Tensor | None, points: int) -> Tensor:
-        """Size (points,), 1/s, of the gradient of the axial velocity; NaN where it was not asked for."""
+        """Size (points,), 1/s, of the gradient of the axial velocity; NaN where it was not asked for.
+
+        Args:
+            ramp: (points, 3), rad per node and image, see :meth:`ramp`.
+            points: how many there are.
+        """
         if ramp is None:
             return self.power.new_full((points,), math.nan)
         acquisition = self.packet.acquisition
@@ -138,11 +159,22 @@ def prepare(
     reach: float,
     least_images: int,
     follow_shear: bool,
-    backend: Backend,
+    backend: TrackingBackend,
 ) -> Prepared:
-    """Filter and pad a packet for kernels of side ``kernel`` and shifts up to ``reach`` between images, m.
+    """Filter and pad a packet.
 
-    Raises ValueError where the filter leaves fewer than ``least_images``.
+    Args:
+        packet: IQ images.
+        clutter: filter over the packet; ``None`` = already filtered.
+        kernel: m, side of a kernel.
+        min_samples: nodes per axis that a kernel needs.
+        reach: m, greatest shift between the images compared.
+        least_images: that are needed after the filter.
+        follow_shear: whether the turn of the echoes from image to image is needed.
+        backend: who does the sums.
+
+    Raises:
+        ValueError: where the filter leaves fewer than ``least_images``.
     """
     if len(packet.iq) < 2:
         raise ValueError(f"speckle tracking compares images; the packet has {len(packet.iq)}")
@@ -150,8 +182,8 @@ def prepare(
     half = [max(round(kernel / (2 * s)), (min_samples - 1) // 2) for s in spacing]
     search = [math.ceil(reach / s + 0.5 - 1e-9) for s in spacing]
     lead = [0] * (3 - packet.grid.dimension)
-    shape = KernelShape(tuple(lead + half), tuple(lead + search))
-    margin = tuple(h + s for h, s in zip(shape.half, shape.search, strict=True))
+    shape = KernelShape(triple(lead + half), triple(lead + search))
+    margin = triple(h + s for h, s in zip(shape.half, shape.search, strict=True))
 
     def solid(images: Tensor) -> Tensor:
         return images.reshape(len(images), *[1] * len(lead), *packet.grid.shape)
@@ -172,21 +204,22 @@ def prepare(
             f"lag of {least_images - 1}; use a longer packet or a shorter filter"
         )
     volume, after, turn = backend.arrange(solid(filtered), margin, turns=follow_shear)
-    averages = [None, None]
+    averages: tuple[Callable[[Tensor], Tensor], ...] | tuple[None, None] = (None, None)
     if turn is not None:
-        averages = [backend.sums_around(turn, tuple(size * h for h in shape.half)) for size in (1, 2)]
+        averages = tuple(backend.sums_around(turn, triple(size * h for h in shape.half)) for size in (1, 2))
     gain = 1.0 if clutter is None else clutter.noise_gain(len(packet.iq))
     return Prepared(
-        packet,
-        shape,
-        volume,
-        after if clutter is None else padded(before),
-        after,
-        spoilt,
-        margin,
-        torch.tensor([1.0] * len(lead) + spacing, dtype=after.dtype, device=after.device),
-        None if packet.noise is None else packet.noise * gain,
-        *averages,
-        tuple(range(len(lead), 3)),
-        backend,
+        packet=packet,
+        shape=shape,
+        volume=volume,
+        raw_power=after if clutter is None else padded(before),
+        power=after,
+        spoilt=spoilt,
+        margin=margin,
+        spacing=torch.tensor([1.0] * len(lead) + spacing, dtype=after.dtype, device=after.device),
+        noise=None if packet.noise is None else packet.noise * gain,
+        turn=averages[0],
+        wide_turn=averages[1],
+        active=tuple(range(len(lead), 3)),
+        backend=backend,
     )

@@ -1,9 +1,8 @@
 """Blood speckle tracking: velocities from the motion of speckle between the images of a packet.
 
 Normalised cross-correlation of small kernels, pooled over the packet, a parabolic sub-sample peak, and the
-echo's phase for the axial component (table 3.1 of the thesis; Trahey, Allison & von Ramm, IEEE TBME 34,
-1987, for the method; Loupas, Powers & Gill, IEEE UFFC 42, 1995, for what the phase adds). Nothing here
-knows how images are made.
+echo's phase for the axial component (Grønli 2017, table 3.1; Trahey, Allison & von Ramm 1987 for the method;
+Loupas, Powers & Gill 1995 for what the phase adds). Nothing here knows how images are made.
 """
 
 from __future__ import annotations
@@ -14,10 +13,10 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from ..scanner.acquisition import Acquisition, Packet, decibel
-from .backends import NAMES, backend
+from ..acquisition import Acquisition, Packet, decibel
+from .backends import NAMES, choose_backend
 from .clutter import ClutterFilter, FIRFilter
-from .correlation import KernelShape
+from .correlation import KernelShape, triple
 from .estimates import Estimates, Flag, bit
 from .gates import gates
 from .motion import Motion, find_motion
@@ -29,27 +28,33 @@ LEAST_CORRELATION = 0.5  # below it peaks of noise are as high, however weak the
 
 @dataclass(frozen=True)
 class SpeckleTracker:
-    """Options of speckle tracking; the defaults are table 3.1 of the thesis.
+    """Options of speckle tracking; the defaults are those of Grønli 2017, table 3.1.
 
-    kernel: side of the kernel, m, on every axis; it covers the nearest odd number of image nodes (7 at 1/6
-    mm). min_samples: nodes per axis that a kernel needs; coarse images widen it, a cut at the border flags
-    it. search: greatest speed per component, m/s.
-    lags: images between compared ones; the first is searched, each further one refines where it is more
-    certain. phase: refine the axial component by the phase of the correlation.
-    follow_shear: turn the samples of a kernel back by what axial velocity differences turn them between
-        images (from the mean phase of successive images), so that shear does not make their products cancel.
-    clutter: filter over the packet, ``None`` = already filtered.
-    min_snr: least power over that of thermal noise after the filter, dB, where the packet states its noise;
-        ``None`` = no gate. max_snr: greatest, dB: tissue is some 40 dB brighter than blood, and what of it
-        passes the filter correlates better than any blood; ``None`` = no gate.
-    min_blood: least share of the unfiltered power that passes the filter, dB, or ``None``.
-    min_response: least response of the clutter filter at the estimate's own Doppler frequency, dB, or ``None``.
-    min_correlation: least correlation; lone_correlation: the same where no longer lag confirms the first,
-        whose axial phase may then be a whole turn off. Both are of what noise and shear leave: echoes that make
-        up a share s of the power need s times as much, and so do those of which shear (where it is followed)
-        leaves a share s of the correlation; but at least 0.5.
-    tile: points worked on at a time, which bounds memory.
-    backend: who does the sums: "cpu", compiled code, "reference", torch on any device, or "auto".
+    Args:
+        kernel: m, side of the kernel on every axis; it covers the nearest odd number of image nodes (7 at 1/6
+            mm).
+        min_samples: nodes per axis that a kernel needs; coarse images widen it, a cut at the border flags it.
+        search: m/s, greatest speed per component.
+        lags: images between compared ones; the first is searched, each further one refines where it is more
+            certain.
+        phase: refine the axial component by the phase of the correlation.
+        follow_shear: turn the samples of a kernel back by what axial velocity differences turn them between
+            images (from the mean phase of successive images), so that shear does not make their products cancel.
+        clutter: filter over the packet; ``None`` = already filtered.
+        min_snr: dB, least power over that of thermal noise after the filter, where the packet states its noise;
+            ``None`` = no gate.
+        max_snr: dB, greatest power over noise: tissue is some 40 dB brighter than blood, and what of it passes
+            the filter correlates better than any blood; ``None`` = no gate.
+        min_blood: dB, least share of the unfiltered power that passes the filter, or ``None``.
+        min_response: dB, least response of the clutter filter at the estimate's own Doppler frequency, or
+            ``None``.
+        min_correlation: least correlation, of what noise and shear leave: echoes that make up a share s of the
+            power need s times as much, and so do those of which shear (where it is followed) leaves a share s of
+            the correlation; but at least 0.5.
+        lone_correlation: the same where no longer lag confirms the first, whose axial phase may then be a whole
+            turn off.
+        tile: points worked on at a time, which bounds memory.
+        backend: who does the sums: "cpu", compiled code, "reference", torch on any device, or "auto".
     """
 
     kernel: float = 1e-3
@@ -83,12 +88,21 @@ class SpeckleTracker:
                 raise ValueError(f"{name} must lie in [0, 1), got {getattr(self, name)!r}")
 
     def track(self, packet: Packet, points: Tensor) -> Estimates:
-        """Velocities at the image nodes nearest to ``points`` (n, D), m. See :func:`track`."""
+        """Velocities at the image nodes nearest to some points, see :func:`track`."""
         return track(packet, points, self)
 
 
 def track(packet: Packet, points: Tensor, options: SpeckleTracker) -> Estimates:
-    """Track ``points`` (n, D) through a packet. ValueError where no two images are left to compare."""
+    """Velocities at the image nodes nearest to some points.
+
+    Args:
+        packet: IQ images.
+        points: (n, D), m, inside the image.
+        options: of the tracker.
+
+    Raises:
+        ValueError: where no two images are left to compare, or points lie outside the image.
+    """
     images = prepare(
         packet,
         options.clutter,
@@ -97,7 +111,7 @@ def track(packet: Packet, points: Tensor, options: SpeckleTracker) -> Estimates:
         reach=options.search * packet.acquisition.interval * options.lags[0],
         least_images=1 + options.lags[0],
         follow_shear=options.follow_shear,
-        backend=backend(options.backend, packet.iq.device),
+        backend=choose_backend(options.backend, packet.iq.device),
     )
     nodes, beam = images.nearest_nodes(points), images.directions(points)
     starts = range(0, max(len(points), 1), options.tile)
@@ -160,7 +174,7 @@ def _follow(images: Prepared, nodes: Tensor, beam: Tensor, ramp: Tensor | None, 
         prior=None,
         phase=options.phase,
     )
-    narrow = KernelShape(wide.half, tuple(min(s, 1) for s in wide.search))
+    narrow = KernelShape(wide.half, triple(min(s, 1) for s in wide.search))
     for lag in (lag for lag in options.lags[1:] if lag < images.volume.shape[-1]):
         offset = (motion.shift * lag / images.spacing).round().long()
         fits = images.holds(nodes + offset)

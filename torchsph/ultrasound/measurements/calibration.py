@@ -23,16 +23,24 @@ LEAST_VARIANCE = 1e-8  # (m/s)^2: 0.1 mm/s; below it the squares of errors would
 
 @dataclass(frozen=True)
 class VarianceModel:
-    """log variance as a rising function, linear between ``knots`` (score, log variance), of a score.
+    """log variance as a rising function of a score, which is features . coefficients.
 
-    The score is features . coefficients; beyond the knots the function is constant, at what the fit has seen.
+    Linear between the knots; beyond them constant, at what the fit has seen.
+
+    Args:
+        coefficients: (K,), one for each feature.
+        knots: pairs of a score and a log variance, rising.
     """
 
     coefficients: tuple[float, ...]
     knots: tuple[tuple[float, float], ...]
 
     def variance(self, table: Tensor) -> Tensor:
-        """(n,), (m/s)^2, from features (n, K)."""
+        """Variance (n,), (m/s)^2.
+
+        Args:
+            table: (n, K), features.
+        """
         score = table @ table.new_tensor(self.coefficients)
         log_variance = torch.full_like(score, self.knots[0][1])
         for (low, start), (high, end) in pairwise(self.knots):
@@ -43,7 +51,13 @@ class VarianceModel:
 
 @dataclass(frozen=True)
 class Calibration:
-    """Variance models across and along the beam; ``reference``: total deviation, m/s, of weight 1/2."""
+    """How precise the estimates of a tracker are, from what it says of them.
+
+    Args:
+        lateral: variance of a component across the beam.
+        axial: variance of the component along it.
+        reference: m/s, total deviation at which the weight is 1/2.
+    """
 
     lateral: VarianceModel
     axial: VarianceModel
@@ -63,11 +77,17 @@ class Calibration:
 
 
 def features(estimates: Estimates, beam: Tensor, axial: bool) -> Tensor:
-    """What the log variance is linear in, (n, 9): 1, predicted log variance, log(1 - rho), log peak ratio, log shear,
-    log bend, and in 10 dB the SNR, the share of power passed by the clutter filter and its response to the velocity.
+    """What the log variance is linear in, (n, 9).
 
-    All bounded, so that an odd estimate cannot ask for an absurd deviation. What a tracker does not tell (NaN) counts
-    as the least that is known: a variance of 1 m^2/s^2, a peak ratio of 1, an SNR of 20 dB.
+    1, predicted log variance, log(1 - rho), log peak ratio, log shear, log bend, and in 10 dB the SNR, the share of
+    power passed by the clutter filter and its response to the velocity. All bounded, so that an odd estimate cannot
+    ask for an absurd deviation. What a tracker does not tell (NaN) counts as the least that is known: a variance of
+    1 m^2/s^2, a peak ratio of 1, an SNR of 20 dB.
+
+    Args:
+        estimates: of n points.
+        beam: (n, D), unit vectors along the beams.
+        axial: whether of the component along the beam or of those across it.
     """
     along = beam.square()
     share = along if axial else (1 - along) / max(beam.shape[1] - 1, 1)
@@ -79,16 +99,25 @@ def features(estimates: Estimates, beam: Tensor, axial: bool) -> Tensor:
     response = torch.nan_to_num(estimates.response, nan=0.0).clamp(-20, 0) / 10
     shear = torch.nan_to_num(estimates.shear, nan=10.0).clamp(10.0, 300.0).log()
     bend = torch.nan_to_num(estimates.bend, nan=0.1).clamp(1e-3, 0.1).log()
-    one = torch.ones_like(predicted)
-    return torch.stack([one, predicted, decorrelation, ratio, shear, bend, snr, power, response], 1)
+    constant = torch.ones_like(predicted)
+    return torch.stack([constant, predicted, decorrelation, ratio, shear, bend, snr, power, response], 1)
 
 
 def fit_calibration(estimates: Estimates, error: Tensor, beam: Tensor) -> Calibration:
-    """Fit to errors (n, D), m/s, of accepted estimates with beams (n, D). Needs at least 50 of them.
+    """Fit variances to the errors of accepted estimates.
 
     The variance of each class is exp(features . c), with c where the Gaussian likelihood of the errors is
     highest. Its first equation is mean(error^2 / variance) = 1: outliers count in full, so the z-scores
     have unit variance.
+
+    Args:
+        estimates: of n points.
+        error: (n, D), m/s, of their velocities.
+        beam: (n, D), unit vectors along the beams.
+
+    Raises:
+        ValueError: where fewer than 50 estimates are accepted.
+        ArithmeticError: where the fit does not converge.
     """
     kept = estimates.accepted
     if int(kept.sum()) < 50:

@@ -9,17 +9,19 @@ import torch
 
 from geometry import Recording
 
+from ..acquisition import Beams
 from ..estimation.doppler import ColourDoppler, colour_doppler, vector_doppler
-from ..scanner.acquisition import Beams
 from .scanning import Canvas, ScannerOptions, scanned
 
 
 @dataclass(frozen=True)
 class DopplerOptions(ScannerOptions):
-    """Options of :func:`measure_doppler`: a scanner and an averaging ``window``, m.
+    """Options of :func:`measure_doppler`: those of the scanner, see :class:`ScannerOptions`, and two of its own.
 
-    steering: ``None`` for colour Doppler along one beam; an angle in degrees for vector Doppler from beams
-    tilted by it to both sides along every lateral axis.
+    Args:
+        window: m, side of the window that is averaged over.
+        steering: ``None`` for colour Doppler along one beam; an angle in degrees for vector Doppler from beams
+            tilted by it to both sides along every lateral axis.
     """
 
     window: float = 1e-3
@@ -47,11 +49,17 @@ class DopplerOptions(ScannerOptions):
 
 
 def measure_doppler(true: Recording, options: DopplerOptions, seed: int, *, progress: bool = False) -> Recording:
-    """What a scanner's Doppler reports of ``true``: every K-th frame, with ``weight`` (coherence) and
-    ``sigma``.
+    """What a scanner's Doppler reports of a recording: every K-th frame, with ``weight`` (coherence) and ``sigma``.
 
-    Colour Doppler gives a recording with ``beam``, its velocity (v . b) b; vector Doppler one of full
-    vectors.
+    Args:
+        true: what is measured.
+        options: of the scanner and the estimate.
+        seed: of scatterers and noise, >= 0.
+        progress: whether to show a bar.
+
+    Returns:
+        By colour Doppler a recording with ``beam``, its velocity (v . b) b; by vector Doppler one of full
+        vectors.
     """
     base = options.echo_model(true.dimension)
     models = [replace(base, beams=beams) for beams in options.beams(true.dimension)]

@@ -2,8 +2,8 @@
 
 The model has the traits that a tracker's errors have and white noise lacks: they are correlated over the
 tracking kernel, grow with shear, blur the flow, lose slow axial flow to the clutter filter and hop to
-false peaks. It is meant for sweeps over noise level and frame rate; :mod:`torchsph.ultrasound.speckle_measurement`
-goes through simulated echoes.
+false peaks. It is meant for sweeps over noise level and frame rate; :func:`measure_speckle` goes through simulated
+echoes.
 """
 
 from __future__ import annotations
@@ -16,31 +16,32 @@ import torch
 from torch import Tensor
 
 from geometry import Recording
-
-from ..estimation.box_sums import fwhm_to_deviation, masked_blur, masked_gradient, smooth_noise
+from geometry.grids.fields import fwhm_to_deviation, masked_blur, masked_gradient, smooth_noise
 
 WEIGHT_FLOOR = 0.02  # a node that was measured at all keeps some weight: 0 is reserved for "nothing measured"
 
 
 @dataclass(frozen=True)
 class NoiseModel:
-    """Options of :func:`measure_noise`; lengths in m, velocities in m/s.
+    """Options of :func:`measure_noise`.
 
-    every: keep each K-th frame of the true recording, starting with the first.
-    lateral, axial: noise deviation across and along the beam, as RMS over the mask of the whole true
-        recording.
-    correlation: FWHM of the Gaussian average that colours the noise; its autocorrelation at this lag is 1/4.
-    blur: FWHM of the Gaussian average (within the mask) that the tracking kernel does to the flow;
-        ``None`` = off.
-    shear: velocity gradient (Frobenius norm, 1/s) at which the noise deviation is twice that of a uniform
-        flow; ``None`` makes the deviation uniform.
-    clutter: axial speed at which the clutter filter passes 1 - 1/e of the blood; below it the residual
-        tissue signal pulls the axial estimate to zero. ``None`` = no clutter filter.
-    dropout: fraction of the nodes below the clutter cut-off that report nothing (weight and velocity 0),
-        in patches as wide as ``correlation``.
-    outliers: fraction of nodes whose peak hops to anywhere in the search range.
-    search: largest speed per component that the tracker looks for; hops are uniform within it.
-    beam_axis: component measured along the beam; the last one is z in volumes, y in planes.
+    Args:
+        every: keep each K-th frame of the true recording, starting with the first.
+        lateral: m/s, noise deviation across the beam, as RMS over the mask of the whole true recording.
+        axial: m/s, the same along the beam.
+        outliers: fraction of nodes whose peak hops to anywhere in the search range.
+        correlation: m, FWHM of the Gaussian average that colours the noise; its autocorrelation at this lag is
+            1/4.
+        blur: m, FWHM of the Gaussian average (within the mask) that the tracking kernel does to the flow;
+            ``None`` = off.
+        shear: 1/s, velocity gradient (Frobenius norm) at which the noise deviation is twice that of a uniform
+            flow; ``None`` makes the deviation uniform.
+        clutter: m/s, axial speed at which the clutter filter passes 1 - 1/e of the blood; below it the residual
+            tissue signal pulls the axial estimate to zero. ``None`` = no clutter filter.
+        dropout: fraction of the nodes below the clutter cut-off that report nothing (weight and velocity 0),
+            in patches as wide as ``correlation``.
+        search: m/s, largest speed per component that the tracker looks for; hops are uniform within it.
+        beam_axis: component measured along the beam; the last one is z in volumes, y in planes.
     """
 
     every: int = 1
@@ -78,17 +79,26 @@ def _require(name: str, value: float, low: float, high: float, rule: str) -> Non
 
 
 def measure_noise(true: Recording, options: NoiseModel, seed: int) -> Recording:
-    """A measurement of ``true`` by the noise model: every K-th frame, walls, valves and mask kept.
-
-    Returns a recording with ``weight`` in [0, 1], which plays the speckle correlation: it follows the
-    blood-to-clutter power (so it rises with axial speed), falls a little with shear and scatters at
-    random, and never sees the noise that was drawn. Its rank correlation with the error is therefore weak,
-    about +0.2 on a ventricle (the sign is that of real trackers after a clutter filter: slow flow is dim
-    and yet not the worst tracked).
+    """A measurement of a recording by the noise model: every K-th frame, walls, valves and mask kept.
 
     The noise of a frame depends on ``seed`` and the frame's index in ``true`` alone, so a sweep over
-    ``every`` compares the same noise. Raises ValueError where ``every`` leaves no second frame although
-    ``true`` has several, or ``beam_axis`` is not a component.
+    ``every`` compares the same noise.
+
+    Args:
+        true: what is measured.
+        options: of the noise model.
+        seed: of the noise, >= 0.
+
+    Returns:
+        A recording with ``weight`` in [0, 1], which plays the speckle correlation: it follows the
+        blood-to-clutter power (so it rises with axial speed), falls a little with shear and scatters at
+        random, and never sees the noise that was drawn. Its rank correlation with the error is therefore weak,
+        about +0.2 on a ventricle (the sign is that of real trackers after a clutter filter: slow flow is dim
+        and yet not the worst tracked).
+
+    Raises:
+        ValueError: where ``every`` leaves no second frame although ``true`` has several, or ``beam_axis`` is
+            not a component.
     """
     dimension = true.velocity.shape[1]
     if not -dimension <= options.beam_axis < dimension:
@@ -123,11 +133,17 @@ def measure_frame(
     *,
     scale: float = 1.0,
 ) -> tuple[Tensor, Tensor]:
-    """One frame: velocity (D, *shape) m/s, mask (*shape) bool -> measured (D, *shape), weight (*shape).
+    """One frame: what is measured (D, *shape), m/s, and its weight (*shape).
 
-    ``spacing`` in m, order x, y, z (the reverse of the array's). ``scale`` multiplies the deviations, to
-    make them RMS values over a recording. The order of the draws is fixed, so that one option leaves the
-    noise of others alone.
+    The order of the draws is fixed, so that one option leaves the noise of others alone.
+
+    Args:
+        velocity: (D, *shape), m/s.
+        mask: (*shape), bool.
+        spacing: (D,), m, in the order x, y, z (the reverse of the array's).
+        options: of the noise model.
+        generator: draws the noise.
+        scale: factor of the deviations, to make them RMS values over a recording.
     """
     dimension = velocity.shape[0]
     axial = options.beam_axis % dimension
@@ -160,7 +176,7 @@ def measure_frame(
 
 
 def noise_growth(velocity: Tensor, mask: Tensor, spacing: tuple[float, ...], options: NoiseModel) -> Tensor:
-    """Factor (*shape) by which velocity gradients raise the noise: 1 + |grad v| / shear."""
+    """Factor (*shape) by which velocity gradients raise the noise: 1 + |grad v| / shear; see :func:`measure_frame`."""
     if options.shear is None:
         return torch.ones(mask.shape, dtype=velocity.dtype)
     gradient = masked_gradient(velocity, mask, spacing)
@@ -198,7 +214,9 @@ def _confidence(passed: Tensor, growth: Tensor, patchy: Tensor, scatter: Tensor)
     return (mean + 0.12 * patchy + 0.12 * scatter).clamp(WEIGHT_FLOOR, 1.0)
 
 
-def _as_measurement(true: Recording, frames: list[int], velocity, weight, options: NoiseModel, seed: int) -> Recording:
+def _as_measurement(
+    true: Recording, frames: list[int], velocity: np.ndarray, weight: np.ndarray, options: NoiseModel, seed: int
+) -> Recording:
     description = (
         f"measurement by a noise model, lateral {options.lateral:g}, axial {options.axial:g} m/s, "
         f"outliers {options.outliers:g}, every {options.every}, seed {seed}"

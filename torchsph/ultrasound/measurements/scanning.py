@@ -13,27 +13,35 @@ from tqdm import tqdm
 
 from geometry import Grid, Recording
 
-from ..estimation.clutter import ClutterFilter, FIRFilter, PolynomialFilter, SVDFilter
-from ..scanner.acquisition import Acquisition, Beams, Packet
+from ..acquisition import Acquisition, Beams, Packet
+from ..estimation.clutter import CLUTTER_FILTERS, ClutterFilter
 from ..scanner.echoes import EchoModel, simulate_packet
 from ..scanner.flow import RecordingFlow
 from ..scanner.pointspread import GaussianPointSpread, SectorPointSpread
 from .noise import frame_seed
 
-FILTERS = {"fir": FIRFilter, "polynomial": PolynomialFilter, "svd": SVDFilter, "none": None}
-
 
 @dataclass(frozen=True)
 class ScannerOptions:
-    """The simulated scanner, in SI units and dB; what is common to speckle and Doppler measurements.
+    """The simulated scanner: what is common to speckle and Doppler measurements.
 
-    every: measure each K-th frame. snr: blood over thermal noise. tissue: echogenicity over blood, outside
-    the blood. clutter: still echoes over blood, within it; ``None`` = none. frequency, sound_speed, prf,
-    packet: see :class:`Acquisition`. axial_width, lateral_width: FWHM of the point spread. image_spacing:
-    between samples of the image (made to divide the recording's spacing). clutter_filter: fir, polynomial,
-    svd or none. beam: direction of the beams, x, y, z; ``None`` = along the last axis. apex: of a sector, from
-    which the beams fan out around ``beam``, x, y, z, m, ``None`` = parallel beams; the lateral width is then
-    that at ``depth`` and grows with it. device: for torch.
+    Args:
+        every: measure each K-th frame.
+        snr: dB, blood over thermal noise.
+        tissue: dB, echogenicity over blood, outside the blood.
+        clutter: dB, still echoes over blood, within it; ``None`` = none.
+        frequency: Hz, see :class:`Acquisition`.
+        sound_speed: m/s.
+        prf: Hz, how often an image is taken.
+        packet: images taken in a row for one estimate.
+        axial_width: m, FWHM of the point spread along the beam.
+        lateral_width: m, the same across it; with an ``apex`` that at ``depth``, growing with it.
+        image_spacing: m, between samples of the image (made to divide the recording's spacing).
+        clutter_filter: fir, polynomial, svd or none.
+        beam: (D,), direction of the beams, x, y, z; ``None`` = along the last axis.
+        apex: (D,), m, of a sector, from which the beams fan out around ``beam``; ``None`` = parallel beams.
+        depth: m, where a sector's beams are ``lateral_width`` wide.
+        device: for torch.
     """
 
     every: int = 1
@@ -58,8 +66,9 @@ class ScannerOptions:
             raise ValueError(f"every must be a whole number >= 1, got {self.every!r}")
         if not (math.isfinite(self.image_spacing) and self.image_spacing > 0):
             raise ValueError(f"image_spacing must be positive and finite, got {self.image_spacing!r}")
-        if self.clutter_filter not in FILTERS:
-            raise ValueError(f"clutter_filter must be one of {', '.join(FILTERS)}, got {self.clutter_filter!r}")
+        if self.clutter_filter not in (*CLUTTER_FILTERS, "none"):
+            known = ", ".join((*CLUTTER_FILTERS, "none"))
+            raise ValueError(f"clutter_filter must be one of {known}, got {self.clutter_filter!r}")
         for name in ("beam", "apex"):
             if getattr(self, name) is not None:
                 object.__setattr__(self, name, tuple(float(part) for part in getattr(self, name)))
@@ -69,8 +78,8 @@ class ScannerOptions:
             filtering.apply(torch.zeros((self.packet, 1), dtype=torch.complex64))  # a packet too short says so
 
     def filter(self) -> ClutterFilter | None:
-        kind = FILTERS[self.clutter_filter]
-        return None if kind is None else kind()
+        """The clutter filter of that name, ``None`` = none."""
+        return None if self.clutter_filter == "none" else CLUTTER_FILTERS[self.clutter_filter]()
 
     def summary(self) -> str:
         """The settings in words, for the description of a recording."""
@@ -80,10 +89,11 @@ class ScannerOptions:
         )
 
     def echo_model(self, dimension: int) -> EchoModel:
+        """The scanner in a space of ``dimension``; ValueError where the beam has another one."""
         direction = self.beam or (0.0,) * (dimension - 1) + (1.0,)
         if len(direction) != dimension:
             raise ValueError(f"beam has {len(direction)} components, the recording {dimension}")
-        shape = GaussianPointSpread(self.axial_width, self.lateral_width)
+        shape: GaussianPointSpread | SectorPointSpread = GaussianPointSpread(self.axial_width, self.lateral_width)
         if self.apex is not None:
             shape = SectorPointSpread(self.axial_width, self.lateral_width, self.depth)
         return EchoModel(
@@ -109,10 +119,21 @@ def scanned(
     *,
     progress: bool,
 ) -> Iterator[tuple[int, Tensor, list[Packet]]]:
-    """For each frame to measure: its number, the points (n, D) inside the mask, and a packet of each model.
+    """Scan the frames to be measured, one after the other.
 
-    All packets of a frame show the same scatterers in the same noise-free motion. ``margin`` (m) of image
-    is kept around the points. Frames without blood give no points and no packets.
+    All packets of a frame show the same scatterers in the same noise-free motion. Frames without blood give no
+    points and no packets.
+
+    Args:
+        true: the flow.
+        options: which frames, and the image's spacing.
+        models: a packet is made for each of them.
+        seed: of scatterers and noise, >= 0.
+        margin: m, of image around the points.
+        progress: whether to show a bar.
+
+    Yields:
+        Number of the frame, the points (n, D), m, inside its mask, and a packet of each model.
     """
     flow = RecordingFlow(true, device=options.device)
     nodes = true.grid.nodes()
@@ -131,7 +152,14 @@ def scanned(
 
 
 def image_grid(grid: Grid, points: Tensor, spacing: tuple[float, ...], margin: float) -> Grid:
-    """The image grid around ``points`` (nodes of ``grid``) whose nodes include them, ``margin`` m wider."""
+    """The image grid around some nodes of a grid, whose own nodes include them.
+
+    Args:
+        grid: of the points.
+        points: (n, D), m, nodes of ``grid``.
+        spacing: (D,), m, of the image, of which those of ``grid`` are multiples.
+        margin: m, of image around the points.
+    """
     extra = [math.ceil(margin / step) for step in spacing]
     lower, upper = points.amin(0).tolist(), points.amax(0).tolist()
     shape = [round((b - a) / s) + 1 + 2 * e for a, b, s, e in zip(lower, upper, spacing, extra, strict=True)]
@@ -141,7 +169,12 @@ def image_grid(grid: Grid, points: Tensor, spacing: tuple[float, ...], margin: f
 
 @dataclass(eq=False)
 class Canvas:
-    """Arrays of a measurement being filled frame by frame; nothing is measured until it is."""
+    """Arrays of a measurement being filled frame by frame; nothing is measured until it is.
+
+    Args:
+        true: what is measured.
+        frames: numbers of the frames that are.
+    """
 
     true: Recording
     frames: list[int]
@@ -153,7 +186,14 @@ class Canvas:
         self.weight = np.zeros((len(self.frames), *shape[1:]), np.float32)
 
     def paint(self, frame: int, velocity: Tensor, sigma: Tensor, weight: Tensor) -> None:
-        """Write (n, D), (n, D), (n,) at the mask's nodes; without weight the velocity is 0."""
+        """Write the estimates of a frame at its mask's n nodes; without weight the velocity is 0.
+
+        Args:
+            frame: its number in ``true``.
+            velocity: (n, D), m/s.
+            sigma: (n, D), m/s, its standard deviation.
+            weight: (n,), from 0 to 1.
+        """
         row, mask = self.frames.index(frame), self.true.mask[frame]
         seen = (weight > 0).cpu()
         self.velocity[row][:, mask] = torch.where(seen[:, None], velocity.cpu(), 0).T.numpy()

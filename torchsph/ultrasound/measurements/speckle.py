@@ -19,8 +19,13 @@ TRAINING = 0x7EA1  # makes the seed of the calibration's simulations differ from
 
 @dataclass(frozen=True)
 class SpeckleOptions(ScannerOptions):
-    """Options of :func:`measure_speckle`: a scanner, and a tracker with a kernel of ``kernel`` m and the
-    search range ``search`` m/s, calibrated on ``training`` simulations of its own."""
+    """Options of :func:`measure_speckle`: those of the scanner, see :class:`ScannerOptions`, and of the tracker.
+
+    Args:
+        kernel: m, side of the kernel.
+        search: m/s, greatest speed per component that is searched for.
+        training: simulations on which the tracker's confidence is calibrated.
+    """
 
     kernel: float = 1e-3
     search: float = 1.0
@@ -32,21 +37,30 @@ class SpeckleOptions(ScannerOptions):
         self.plan()
 
     def tracker(self) -> SpeckleTracker:
+        """The tracker with this kernel, search range and clutter filter."""
         # a scanner's operator knows about how bright blood is; speckle alone hardly takes a kernel 6 dB above that
         max_snr = self.snr + BRIGHTEST
         return SpeckleTracker(kernel=self.kernel, search=self.search, clutter=self.filter(), max_snr=max_snr)
 
     def plan(self) -> TrainingPlan:
+        """The simulations on which it is calibrated."""
         return TrainingPlan(simulations=self.training)
 
 
 def measure_speckle(true: Recording, options: SpeckleOptions, seed: int, *, progress: bool = False) -> Recording:
-    """What a scanner and a speckle tracker report of ``true``: every K-th frame, with ``weight`` and
-    ``sigma``.
+    """What a scanner and a speckle tracker report of a recording: every K-th frame, with ``weight`` and ``sigma``.
 
     Weight and sigma are fitted on random scenes imaged by the same scanner with other seeds, never on
-    ``true``. Flagged estimates have weight and velocity 0. Raises ValueError where beam and recording
-    differ in dimension.
+    ``true``. Flagged estimates have weight and velocity 0.
+
+    Args:
+        true: what is measured.
+        options: of scanner and tracker.
+        seed: of scatterers and noise, >= 0.
+        progress: whether to show a bar.
+
+    Raises:
+        ValueError: where beam and recording differ in dimension.
     """
     model, tracker = options.echo_model(true.dimension), options.tracker()
     spacing = options.spacing(true.grid)

@@ -16,7 +16,7 @@ from ..scanner.echoes import EchoModel, simulate_packet
 from .calibration import Calibration, fit_calibration
 
 IN_PLANE = 4
-FINEST, COARSEST = 0.25, 3.0  # 2 mm, which is twice a kernel of table 3.1, to 24 mm for the default plan
+FINEST, COARSEST = 0.25, 3.0  # 2 mm, twice a kernel of Grønli 2017, table 3.1, to 24 mm in the default plan
 SMOOTHEST = 4.0  # times FINEST
 NEAREST, FARTHEST = 0.25, 1.5  # of the wall from the middle of the view, in half sides of the latter
 FLATTEST = 5.0  # radius of the wall's curvature, likewise
@@ -26,9 +26,16 @@ FLATTEST = 5.0  # radius of the wall's curvature, likewise
 class SwirlFlow:
     """Random divergence-free flow in a ball (a disc in 2-D) of tissue that moves as a whole, steady in time.
 
-    A sum of transverse plane waves, each a random ``wave`` vector (m, D), rad/m, with an ``amplitude`` (m, D)
-    across it, m/s, and a ``phase`` (m,), on top of a ``mean`` (D,); blood within ``radius`` of ``centre``.
-    ``tissue`` (D,): velocity of the tissue, m/s.
+    A sum of m transverse plane waves on top of a mean.
+
+    Args:
+        wave: (m, D), rad/m, wave vectors.
+        amplitude: (m, D), m/s, each across its wave vector.
+        phase: (m,), rad.
+        mean: (D,), m/s.
+        centre: (D,), m, of the ball.
+        radius: m, within which there is blood.
+        tissue: (D,), m/s, velocity of the tissue.
     """
 
     wave: Tensor
@@ -40,6 +47,7 @@ class SwirlFlow:
     tissue: Tensor
 
     def velocity(self, points: Tensor, time: float) -> Tensor:
+        """See :class:`Flow`."""
         offset = points - self.centre.to(points)
         field = torch.sin(offset @ self.wave.to(points).T + self.phase.to(points)) @ self.amplitude.to(points)
         # no slip: the last half millimetre of blood goes over to the velocity of the tissue
@@ -47,6 +55,7 @@ class SwirlFlow:
         return (field + self.mean.to(points)) * fade + self.tissue.to(points) * (1 - fade)
 
     def blood(self, points: Tensor, time: float) -> Tensor:
+        """See :class:`Flow`."""
         return (points - self.centre.to(points)).norm(dim=1) < self.radius
 
 
@@ -60,12 +69,19 @@ def random_swirl(
     tissue_speed: float = 0.0,
     finest: float = FINEST,
 ) -> SwirlFlow:
-    """A swirl of RMS ``speed``, m/s, with wavelengths of ``finest`` to ``COARSEST`` diameters of the ball.
+    """A swirl with wavelengths of ``finest`` to ``COARSEST`` diameters of the ball.
 
     They are spread evenly on a logarithmic scale: vortices as large as a ventricle, shear layers that a kernel
     hardly resolves.
 
-    Each component of the tissue's velocity is drawn with a deviation of ``tissue_speed``, m/s.
+    Args:
+        centre: (D,), m, of the ball.
+        radius: m, of the ball.
+        speed: m/s, RMS of the flow.
+        generator: draws the flow, on the device of its tensors.
+        waves: how many plane waves.
+        tissue_speed: m/s, standard deviation of each component of the tissue's velocity.
+        finest: shortest wavelength, in diameters of the ball.
     """
     dimension = len(centre)
 
@@ -87,12 +103,16 @@ def random_swirl(
 
 @dataclass(frozen=True)
 class TrainingPlan:
-    """simulations: packets in space; a plane, which holds fewer points, takes ``IN_PLANE`` times as many.
+    """The simulations on which a tracker is calibrated.
 
-    half: half the side of the cube (square) that is tracked, m. margin: of image around it, m. step: between
-    points, m.
-    slowest, fastest: RMS speeds, m/s, spread evenly over the simulations on a logarithmic scale.
-    tissue_speed: deviation of each component of the tissue's velocity, m/s.
+    Args:
+        simulations: packets in space; a plane, which holds fewer points, takes ``IN_PLANE`` times as many.
+        half: m, half the side of the cube (square) that is tracked.
+        margin: m, of image around it.
+        step: m, between points.
+        slowest: m/s, least RMS speed; they are spread evenly over the simulations on a logarithmic scale.
+        fastest: m/s, greatest RMS speed.
+        tissue_speed: m/s, standard deviation of each component of the tissue's velocity.
     """
 
     simulations: int = 48
@@ -114,17 +134,25 @@ class TrainingPlan:
 def random_scene(
     centre: tuple[float, ...], half: float, speed: float, generator: torch.Generator, *, tissue_speed: float = 0.0
 ) -> SwirlFlow:
-    """Blood beside a wall of tissue, in view of a cube (square) of ``half`` its side around ``centre``, m.
+    """Blood beside a wall of tissue, in view of a cube (square).
 
     How far the wall is from the centre, where it lies and how it is bent are random, and so is how smooth the
-    flow of RMS ``speed`` is: one half of the flows has wavelengths down to ``FINEST`` diameters of the view, the
+    flow is: one half of the flows has wavelengths down to ``FINEST`` diameters of the view, the
     shortest of the other half are anywhere from there to ``SMOOTHEST`` times as long. What a flow does within a
     kernel hardly shows in its echoes, yet shifts a kernel's mean.
+
+    Args:
+        centre: (D,), m, of the view.
+        half: m, half the side of the view.
+        speed: m/s, RMS of the flow.
+        generator: draws wall and flow.
+        tissue_speed: m/s, standard deviation of each component of the tissue's velocity.
     """
     dimension = len(centre)
-    like = {"generator": generator, "dtype": torch.float64, "device": generator.device}
-    near, bent, smooth = torch.rand(3, **like).tolist()
-    away = torch.nn.functional.normalize(torch.randn(dimension, **like), dim=0)
+    device = generator.device
+    near, bent, smooth = torch.rand(3, generator=generator, dtype=torch.float64, device=device).tolist()
+    normal = torch.randn(dimension, generator=generator, dtype=torch.float64, device=device)
+    away = torch.nn.functional.normalize(normal, dim=0)
     finest = FINEST * SMOOTHEST ** max(0.0, 2 * smooth - 1)
     swirl = random_swirl(centre, half, speed, generator, tissue_speed=tissue_speed, finest=finest)
     radius = half * (1 + (FLATTEST - 1) * bent)
@@ -133,7 +161,7 @@ def random_scene(
 
 
 def training_points(plan: TrainingPlan, centre: tuple[float, ...]) -> Tensor:
-    """A lattice of points (n, D) around ``centre``, to be tracked where they lie in blood."""
+    """A lattice of points (n, D), m, around ``centre`` (D,), m, to be tracked where they lie in blood."""
     count = int(plan.half / plan.step)
     axis = torch.arange(-count, count + 1, dtype=torch.float64) * plan.step
     return torch.cartesian_prod(*[axis] * len(centre)) + axis.new_tensor(centre)
@@ -148,9 +176,15 @@ def calibrate(
     *,
     centre: tuple[float, ...] | None = None,
 ) -> Calibration:
-    """Fit deviations and weights of ``tracker`` on random scenes; image ``spacing`` x, y, z, m.
+    """Fit deviations and weights of a tracker on random scenes.
 
-    centre: of the scenes, m, where beams from an apex make the place matter; ``None`` = the origin.
+    Args:
+        model: the scanner.
+        tracker: what is calibrated.
+        spacing: (D,), m, of the image, in the order x, y, z.
+        generator: draws scenes, scatterers and noise.
+        plan: how many scenes, and what they are like.
+        centre: (D,), m, of the scenes, where beams from an apex make the place matter; ``None`` = the origin.
     """
     centre = centre or (0.0,) * len(spacing)
     reach = plan.half + plan.margin

@@ -16,8 +16,15 @@ OVERSAMPLING = 1.5
 class Convolution:
     """Scatterers to the Fourier series of their image in a periodic box.
 
-    ``origin``, ``sides``: of the box, in the order of the coordinates (x, y, z); ``direction``: of the beam
-    in them. The box must leave room for the reach of the point-spread function outside what is looked at.
+    The box must leave room for the reach of the point-spread function outside what is looked at.
+
+    Args:
+        origin: (D,), m, lowest corner of the box, in the order of the coordinates x, y, z.
+        sides: (D,), m, of the box.
+        pointspread: how one scatterer looks.
+        direction: (D,), unit vector along the beams.
+        width: nodes per axis that a scatterer is spread over, see :class:`Gridding`.
+        like: a tensor of the precision and on the device to work in.
     """
 
     def __init__(
@@ -47,7 +54,12 @@ class Convolution:
         self._colour = transform.abs() / transform.abs().square().sum().sqrt()
 
     def series(self, points: Tensor, amplitude: Tensor) -> Tensor:
-        """Fourier series (*lattice) of the image of ``amplitude`` (n,) complex at ``points`` (n, D)."""
+        """Fourier series (*lattice) of an image of scatterers.
+
+        Args:
+            points: (n, D), m, where the scatterers are.
+            amplitude: (n,), complex.
+        """
         return torch.fft.fftn(self.lattice.spread(points, amplitude)) * self._window
 
     def noise(self, generator: torch.Generator) -> Tensor:

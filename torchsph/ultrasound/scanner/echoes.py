@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 
 from geometry import Grid
 
-from .acquisition import Acquisition, Beams, Packet
+from ..acquisition import Acquisition, Beams, Packet
 from .flow import Flow
 from .image import Imager, ParallelImager
 from .pointspread import GaussianPointSpread, PointSpread, SectorPointSpread
@@ -21,13 +21,17 @@ from .sector import SectorImager
 class EchoModel:
     """Options of :func:`simulate_packet`.
 
-    pointspread: a :class:`SectorPointSpread` for beams from an apex, any other for parallel ones.
-    snr: blood speckle power over thermal noise power, dB; ``None`` = no noise.
-    tissue: echogenicity of tissue over blood, dB; ``None`` = tissue is silent.
-    clutter: stationary echo power over blood power inside the blood (reverberation, side lobes), dB;
-        ``None`` = none. ``clutter_velocity``, m/s, lets it move (D numbers, ``None`` = still).
-    density: scatterers per integral of the point spread's square. The intensity's normalised second moment
-        is then above that of fully developed speckle, 2, by about 0.35 / density in space (0.5 in a plane).
+    Args:
+        acquisition: timing and wave.
+        pointspread: a :class:`SectorPointSpread` for beams from an apex, any other for parallel ones.
+        beams: where the beams point.
+        snr: dB, blood speckle power over thermal noise power; ``None`` = no noise.
+        tissue: dB, echogenicity of tissue over blood; ``None`` = tissue is silent.
+        clutter: dB, stationary echo power over blood power inside the blood (reverberation, side lobes);
+            ``None`` = none.
+        clutter_velocity: (D,), m/s, of the clutter; ``None`` = still.
+        density: scatterers per integral of the point spread's square. The intensity's normalised second moment
+            is then above that of fully developed speckle, 2, by about 0.35 / density in space (0.5 in a plane).
     """
 
     acquisition: Acquisition = Acquisition()
@@ -59,10 +63,21 @@ def simulate_packet(
     *,
     dtype: torch.dtype = torch.float32,
 ) -> Packet:
-    """IQ images of ``flow`` on ``grid``, centred in time on ``time`` (s), of blood power 1.
+    """IQ images of a flow, of blood power 1.
 
     Scatterers are seeded afresh at the first image and reseeded at every following one where they leave or
-    thin out. Runs on the generator's device. Raises ValueError where dimensions disagree.
+    thin out. Runs on the generator's device.
+
+    Args:
+        flow: what moves the scatterers, and which of them are blood.
+        grid: the image grid.
+        model: options of scanner and echoes.
+        time: s, the middle of the packet.
+        generator: draws scatterers and noise.
+        dtype: precision of the samples' parts.
+
+    Raises:
+        ValueError: where beams and grid differ in dimension.
     """
     if model.beams.dimension != grid.dimension:
         raise ValueError(f"beams are {model.beams.dimension}-D, the grid {grid.dimension}-D")
@@ -72,22 +87,25 @@ def simulate_packet(
     density = model.density / float(energy.min())  # where the point spread is smallest
     start = time - 0.5 * (acquisition.packet - 1) * acquisition.interval
     cloud = seed_cloud(box, flow, start, density, generator, dtype=dtype)
-    haze = None if model.clutter is None else seed_cloud(box, flow, start, density, generator, dtype=dtype)
+    haze = None
+    if model.clutter is not None:
+        haze = seed_cloud(box, flow, start, density, generator, dtype=dtype)
+        haze = replace(haze, amplitude=haze.amplitude * 10 ** (model.clutter / 20))
     # density * energy is the speckle power of unit amplitudes, so this makes the blood's power 1 everywhere
     scale = 1 / (density * energy).sqrt()
     noise = 0.0 if model.snr is None else 10 ** (-model.snr / 10)
     images = torch.empty((acquisition.packet, *grid.shape), dtype=dtype.to_complex(), device=generator.device)
     for number in range(acquisition.packet):
-        now = start + number * acquisition.interval
+        image_time = start + number * acquisition.interval
         position, amplitude = cloud.position, _echogenicity(cloud, model)
         if haze is not None:
-            shift = haze.position.new_tensor(model.clutter_velocity or (0.0,) * grid.dimension) * (now - time)
-            position = torch.cat([position, haze.position + shift])
-            amplitude = torch.cat([amplitude, haze.amplitude * 10 ** (model.clutter / 20)])
+            shift = haze.position.new_tensor(model.clutter_velocity or (0.0,) * grid.dimension)
+            position = torch.cat([position, haze.position + shift * (image_time - time)])
+            amplitude = torch.cat([amplitude, haze.amplitude])
         images[number] = imager.noisy_image(position, amplitude, scale, noise, generator)
         if number + 1 < acquisition.packet:
-            cloud = carry(cloud, box, flow, now, acquisition.interval, density, generator)
-            cloud = reseed(cloud, box, flow, now + acquisition.interval, density, generator)
+            cloud = carry(cloud, box, flow, image_time, acquisition.interval, density, generator)
+            cloud = reseed(cloud, box, flow, image_time + acquisition.interval, density, generator)
     return Packet(images, grid, acquisition, model.beams, noise)
 
 
@@ -95,8 +113,9 @@ def make_imager(
     grid: Grid, model: EchoModel, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu"
 ) -> Imager:
     """The imager for the model's beams."""
-    kind = ParallelImager if model.beams.apex is None else SectorImager
-    return kind(grid, model.pointspread, model.acquisition, model.beams, dtype=dtype, device=device)
+    if isinstance(model.pointspread, SectorPointSpread):
+        return SectorImager(grid, model.pointspread, model.acquisition, model.beams, dtype=dtype, device=device)
+    return ParallelImager(grid, model.pointspread, model.acquisition, model.beams, dtype=dtype, device=device)
 
 
 def _box(grid: Grid, model: EchoModel) -> Box:
@@ -105,7 +124,7 @@ def _box(grid: Grid, model: EchoModel) -> Box:
         # as for parallel beams of the farthest corner's width, whatever their direction
         farthest, spread = float(model.beams.depth(grid.nodes()).max()), model.pointspread
         widest = GaussianPointSpread(spread.axial, spread.lateral * farthest / spread.depth)
-        reach = (max(widest.reach(model.beams.direction)),) * grid.dimension
+        reach: tuple[float, ...] = (max(widest.reach(model.beams.direction)),) * grid.dimension
     else:
         reach = model.pointspread.reach(model.beams.direction)
     lower = tuple(a - r for a, r in zip(grid.origin, reach, strict=True))

@@ -31,10 +31,12 @@ class Flow(Protocol):
 
 @dataclass(frozen=True)
 class LinearFlow:
-    """Blood everywhere, velocity + gradient (x - centre): uniform motion, shear, rotation, at rest in time.
+    """Blood everywhere that moves by at_centre + gradient (x - centre): uniform motion, shear, rotation; steady.
 
-    velocity: D numbers, m/s. gradient: D x D numbers, 1/s, row = component, column = direction; ``None`` =
-    uniform.
+    Args:
+        at_centre: (D,), m/s, the velocity at the centre.
+        gradient: (D, D), 1/s, row = component, column = direction; ``None`` = uniform.
+        centre: (D,), m; ``None`` = the origin.
     """
 
     at_centre: tuple[float, ...]
@@ -42,6 +44,7 @@ class LinearFlow:
     centre: tuple[float, ...] | None = None
 
     def velocity(self, points: Tensor, time: float) -> Tensor:
+        """See :class:`Flow`."""
         value = points.new_tensor(self.at_centre).expand_as(points)
         if self.gradient is None:
             return value
@@ -49,6 +52,7 @@ class LinearFlow:
         return value + offset @ points.new_tensor(self.gradient).T
 
     def blood(self, points: Tensor, time: float) -> Tensor:
+        """See :class:`Flow`."""
         return torch.ones(len(points), dtype=torch.bool, device=points.device)
 
 
@@ -58,8 +62,13 @@ class RecordingFlow:
     Beyond an orifice (where the nearest vertex belongs to no wall face) the blood goes on with the
     velocity of the nearest node inside. Cubic between the nodes and linear in time, so velocity is continuous
     across the wall: a field that were linear would have its kinks at the very nodes that are measured, and differ
-    there from its own mean over a kernel by twice as much as a smooth one. ``margin`` (m) is how far the field
-    reaches beyond the recording's grid; it is constant further out.
+    there from its own mean over a kernel by twice as much as a smooth one.
+
+    Args:
+        recording: the motion.
+        margin: m, how far the field reaches beyond the recording's grid; it is constant further out.
+        dtype: precision of the field.
+        device: where it is kept.
     """
 
     def __init__(
@@ -77,6 +86,7 @@ class RecordingFlow:
         self._cache: dict[int, tuple[Tensor, Tensor]] = {}
 
     def velocity(self, points: Tensor, time: float) -> Tensor:
+        """See :class:`Flow`."""
         first, share = self._place(time)
         field = self._frame(first)[0]
         if share > 0:
@@ -84,6 +94,7 @@ class RecordingFlow:
         return self._sample(field, points).T
 
     def blood(self, points: Tensor, time: float) -> Tensor:
+        """See :class:`Flow`."""
         first, share = self._place(time)
         inside = self._frame(first)[1]
         if share > 0:
@@ -105,13 +116,12 @@ class RecordingFlow:
         if frame not in self._cache:
             while len(self._cache) > 3:
                 self._cache.pop(next(iter(self._cache)))
-            velocity, blood = self._extend(frame)
-            place = {"dtype": self._dtype, "device": self._device}
-            velocity = refined(torch.as_tensor(velocity, **place), REFINEMENT)
-            self._cache[frame] = velocity, torch.as_tensor(blood, **place)[None]
+            velocity, blood = (torch.as_tensor(f, dtype=self._dtype, device=self._device) for f in self._extend(frame))
+            self._cache[frame] = refined(velocity, REFINEMENT), blood[None]
         return self._cache[frame]
 
     def _extend(self, frame: int) -> tuple[np.ndarray, np.ndarray]:
+        """Velocity (D, *padded), m/s, and blood (*padded), bool, at every node of the padded grid."""
         recording, pad = self._recording, self._pad
         mask = np.pad(recording.mask[frame], pad)
         velocity = np.pad(recording.velocity[frame], [(0, 0)] + [(pad, pad)] * mask.ndim)
@@ -140,9 +150,13 @@ class RecordingFlow:
 
 
 def refined(field: Tensor, factor: int) -> Tensor:
-    """``field`` (C, *shape) on a grid ``factor`` times as fine, by cubic convolution (Keys, IEEE TASSP 29, 1981).
+    """A field on a finer grid, by cubic convolution (Keys 1981).
 
     Exact for quadratics away from the rim, where the last node is repeated; the nodes keep their values.
+
+    Args:
+        field: (C, *shape).
+        factor: cells of the fine grid per cell of the coarse one, along every axis.
     """
     for axis in range(1, field.dim()):
         count = field.shape[axis]

@@ -1,7 +1,7 @@
 """Points to a periodic lattice and back without aliasing: gridding with a compact kernel.
 
-The non-uniform Fourier transform with the "exponential of semicircle" kernel of Barnett, Magland & af
-Klinteberg (SIAM J. Sci. Comput. 41, 2019). Each point is spread over a few nodes; dividing the lattice's
+The non-uniform Fourier transform with the "exponential of semicircle" kernel of Barnett, Magland & af Klinteberg
+2019. Each point is spread over a few nodes; dividing the lattice's
 Fourier transform by the kernel's undoes the smearing. What remains is the aliased tail of the kernel:
 about 1e-3 at four nodes and an oversampling of 1.5, falling some tenfold per node.
 """
@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import ctypes
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import product
 
@@ -18,33 +19,21 @@ import torch
 from torch import Tensor
 
 from torchsph.native.library import REALS, LibraryMissing, library
+from torchsph.native.structures import GriddingArguments
 
 CHUNK = 1 << 14  # points spread at a time: their stencils stay in the cache
 
 
-_pointer, _int, _long, _real = ctypes.c_void_p, ctypes.c_int32, ctypes.c_int64, ctypes.c_double
-
-
-class _Arguments(ctypes.Structure):
-    """sph_gridding of csrc/interface.h."""
-
-    _fields_ = [
-        *((name, _int) for name in ("threads", "dimension", "width")),
-        ("shape_parameter", _real),
-        *((name, _real * 3) for name in ("origin", "spacing")),
-        ("counts", _long * 3),
-        ("points", _long),
-        *((name, _pointer) for name in ("position", "values", "field")),
-    ]
-
-
 @dataclass(frozen=True)
 class Gridding:
-    """A periodic lattice: node (k, j, i) at ``origin + spacing * (i, j, k)``, the box repeats after
-    ``shape`` nodes.
+    """A periodic lattice: node (k, j, i) at ``origin + spacing * (i, j, k)``, the box repeats after ``shape`` nodes.
 
-    width: nodes per axis that a point touches. oversampling: Nyquist frequency of the lattice over the
-    highest frequency that has to be right.
+    Args:
+        origin: (D,), m, of node 0, in the order x, y, z.
+        spacing: (D,), m, between nodes, in the order x, y, z.
+        shape: (D,), nodes per axis, in the order of the array.
+        width: nodes per axis that a point touches.
+        oversampling: Nyquist frequency of the lattice over the highest frequency that has to be right.
     """
 
     origin: tuple[float, ...]
@@ -63,14 +52,18 @@ class Gridding:
 
     @property
     def shape_parameter(self) -> float:
-        """Beta of the kernel exp(beta (sqrt(1 - z^2) - 1)) (Barnett 2019, section 3.2)."""
+        """Beta of the kernel exp(beta (sqrt(1 - z^2) - 1)) (Barnett, Magland & af Klinteberg 2019, sec. 3.2)."""
         return 0.97 * math.pi * self.width * (1 - 0.5 / self.oversampling)
 
     def spread(self, points: Tensor, values: Tensor) -> Tensor:
-        """Add ``values`` (n,), real or complex, at ``points`` (n, D) to a lattice of zeros: (*shape).
+        """Add values to a lattice of zeros: (*shape).
 
         Complex ones by compiled code where there is some (0.4 million points in 3-D, one core: 30 ms), else by
         torch (175 ms).
+
+        Args:
+            points: (n, D), m.
+            values: (n,), real or complex.
         """
         field = values.new_zeros(math.prod(self.shape))
         compiled = _compiled("spread", points, values)
@@ -96,18 +89,18 @@ class Gridding:
             parts.append((flat[nodes] * weights).sum(1))
         return torch.cat(parts) if parts else flat.new_zeros(0)
 
-    def _call(self, function: ctypes._CFuncPtr, points: Tensor, values: Tensor, field: Tensor) -> None:
-        points, triple, dimension = points.contiguous(), _real * 3, len(self.shape)
+    def _call(self, function: Callable[..., object], points: Tensor, values: Tensor, field: Tensor) -> None:
+        points, triple, dimension = points.contiguous(), ctypes.c_double * 3, len(self.shape)
         function(
             ctypes.byref(
-                _Arguments(
+                GriddingArguments(
                     threads=torch.get_num_threads(),
                     dimension=dimension,
                     width=self.width,
                     shape_parameter=self.shape_parameter,
                     origin=triple(*self.origin),
                     spacing=triple(*self.spacing),
-                    counts=(_long * 3)(*reversed(self.shape)),
+                    counts=(ctypes.c_int64 * 3)(*reversed(self.shape)),
                     points=len(points),
                     position=points.data_ptr(),
                     values=values.data_ptr(),
@@ -123,8 +116,8 @@ class Gridding:
 
     def correction(self, axis: int, like: Tensor) -> Tensor:
         """Fourier transform (nodes,) of the kernel along an axis, to divide the lattice's by."""
-        place, share = np.polynomial.legendre.leggauss(24 + 2 * self.width)  # to round-off up to Nyquist
-        place, share = torch.from_numpy(place), torch.from_numpy(share)
+        # to round-off up to Nyquist
+        place, share = (torch.from_numpy(part) for part in np.polynomial.legendre.leggauss(24 + 2 * self.width))
         half = 0.5 * self.width * self.wavenumbers(axis, place) * self.spacing[axis]
         integral = torch.cos(half[:, None] * place) @ (share * self._kernel(place))
         return (0.5 * self.width * integral).to(like)
@@ -151,7 +144,7 @@ class Gridding:
         return torch.where(distance.abs() <= 1, torch.exp(self.shape_parameter * (root - 1)), 0)
 
 
-def _compiled(name: str, points: Tensor, samples: Tensor) -> ctypes._CFuncPtr | None:
+def _compiled(name: str, points: Tensor, samples: Tensor) -> Callable[..., object] | None:
     """Compiled sums for complex samples on the CPU; None where torch has to do."""
     derived = torch.is_grad_enabled() and (points.requires_grad or samples.requires_grad)
     known = points.dtype in REALS and samples.dtype == points.dtype.to_complex()

@@ -1,7 +1,7 @@
 """Scatterers to IQ images: a convolution with the point-spread function, done in k-space.
 
-The idea of FUSK (Hergum et al., IEEE Trans. Ultrason. Ferroelectr. Freq. Control 56, 2009): an image is the
-scatterers' Fourier transform times that of the point-spread function. Single scattering, one speed of sound.
+The idea of FUSK (Hergum et al. 2009): an image is the scatterers' Fourier transform times that of the point-spread
+function. Single scattering, one speed of sound.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from torch import Tensor
 
 from geometry import Grid
 
-from .acquisition import Acquisition, Beams
+from ..acquisition import Acquisition, Beams
 from .convolution import Convolution
 from .gridding import fast_length
 from .pointspread import PointSpread
@@ -24,23 +24,37 @@ PLANE_BYTES = 4 << 20  # of a transform's temporary arrays
 
 
 class Imager(Protocol):
-    """Forms images on a grid.
+    """Forms images on a grid."""
 
-    energy: integral of |h|^2, m^D, over the scatterers' positions, a number or one for each node: the power
-    that one scatterer of power 1 per m^D gives on average.
-    """
+    @property
+    def energy(self) -> float | Tensor:
+        """Integral of |h|^2, m^D, over the scatterers' positions, a number or one for each node (*shape).
 
-    energy: float | Tensor
+        The power that one scatterer of power 1 per m^D gives on average.
+        """
+        ...
 
     def image(self, points: Tensor, amplitude: Tensor) -> Tensor:
-        """IQ (*shape) of scatterers at ``points`` (n, D), m, with complex ``amplitude`` (n,)."""
+        """IQ (*shape) of scatterers, without noise.
+
+        Args:
+            points: (n, D), m.
+            amplitude: (n,), complex.
+        """
         ...
 
     def noisy_image(
         self, points: Tensor, amplitude: Tensor, gain: Tensor, noise: float, generator: torch.Generator
     ) -> Tensor:
-        """:meth:`image` times ``gain`` (in the shape of ``energy``), in circular Gaussian noise of power
-        ``noise`` in the band of the point-spread function."""
+        """:meth:`image` times a gain, in circular Gaussian noise in the band of the point-spread function.
+
+        Args:
+            points: (n, D), m.
+            amplitude: (n,), complex.
+            gain: in the shape of ``energy``.
+            noise: power of the noise; 0 draws none.
+            generator: draws the noise.
+        """
         ...
 
 
@@ -49,6 +63,18 @@ class ParallelImager:
 
     The box of the grid is enlarged by the reach of the point-spread function, so that the periodic Fourier
     transform wraps nothing into view; scatterers beyond that margin are left out.
+
+    Args:
+        grid: the image grid.
+        pointspread: how one scatterer looks.
+        acquisition: the wave.
+        beams: parallel beams.
+        width: nodes per axis that a scatterer is spread over, see :class:`Gridding`.
+        dtype: precision of the samples' parts.
+        device: where images are formed.
+
+    Raises:
+        ValueError: where the beams come from an apex.
     """
 
     def __init__(
@@ -83,9 +109,11 @@ class ParallelImager:
         )
 
     def image(self, points: Tensor, amplitude: Tensor) -> Tensor:
-        """IQ (*shape) of scatterers at ``points`` (n, D), m, with complex ``amplitude`` (n,).
+        """IQ (*shape) of scatterers: one of amplitude 1 gives h(x - point) exp(-i 4 pi f depth / c).
 
-        A lone scatterer of amplitude 1 gives h(x - point) exp(-i 4 pi f depth / c).
+        Args:
+            points: (n, D), m.
+            amplitude: (n,), complex.
         """
         return self._render(self._series(points, amplitude))
 
@@ -134,8 +162,13 @@ class ParallelImager:
 
 
 def resize_spectrum(spectrum: Tensor, axis: int, nodes: int) -> Tensor:
-    """Zero-pad or crop a Fourier series (in FFT order) to ``nodes`` terms along an axis: the same function on
-    other nodes."""
+    """The same function on other nodes: a Fourier series zero-padded or cropped along an axis.
+
+    Args:
+        spectrum: of any shape, in FFT order along the axis.
+        axis: which axis.
+        nodes: terms that are to be left or made along it.
+    """
     have = spectrum.shape[axis]
     keep = min(have, nodes)
     positive, negative = (keep + 1) // 2, (keep - 1) // 2  # an unpaired Nyquist term is dropped

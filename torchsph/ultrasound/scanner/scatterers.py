@@ -13,7 +13,12 @@ from .flow import Flow
 
 @dataclass(frozen=True)
 class Box:
-    """The region that is kept filled: ``lower`` and ``upper`` corners, x, y, z, m."""
+    """The region that is kept filled with scatterers.
+
+    Args:
+        lower: (D,), m, the lowest corner, in the order x, y, z.
+        upper: (D,), m, the highest corner.
+    """
 
     lower: tuple[float, ...]
     upper: tuple[float, ...]
@@ -24,19 +29,28 @@ class Box:
 
     @property
     def sides(self) -> tuple[float, ...]:
+        """Lengths (D,), m."""
         return tuple(b - a for a, b in zip(self.lower, self.upper, strict=True))
 
     @property
     def volume(self) -> float:
+        """Volume, m^D."""
         return math.prod(self.sides)
 
     def contains(self, points: Tensor) -> Tensor:
+        """Whether points (n, D), m, lie inside: (n,) bool."""
         return ((points >= points.new_tensor(self.lower)) & (points <= points.new_tensor(self.upper))).all(1)
 
 
 @dataclass(frozen=True, eq=False)
 class Cloud:
-    """Scatterers: ``position`` (n, D), m; ``amplitude`` (n,) complex, mean power 1; ``tissue`` (n,) bool."""
+    """A set of n scatterers.
+
+    Args:
+        position: (n, D), m.
+        amplitude: (n,), complex, of mean power 1 where it is blood.
+        tissue: (n,), bool.
+    """
 
     position: Tensor
     amplitude: Tensor
@@ -52,7 +66,16 @@ def seed_cloud(
     *,
     dtype: torch.dtype = torch.float32,
 ) -> Cloud:
-    """Scatterers uniformly at random in ``box``, ``density`` per m^D, of power 1 and random phase."""
+    """Scatterers uniformly at random in a box, of power 1 and random phase.
+
+    Args:
+        box: what is filled.
+        flow: tells blood from tissue.
+        time: s.
+        density: scatterers per m^D.
+        generator: draws places and phases, on the device of the cloud.
+        dtype: precision of the positions.
+    """
     if not density > 0:
         raise ValueError(f"scatterer density must be positive (per m^D), got {density!r}")
     count = max(1, round(density * box.volume))
@@ -62,7 +85,14 @@ def seed_cloud(
 
 
 def advance(position: Tensor, flow: Flow, time: float, step: float) -> Tensor:
-    """Positions (n, D) after ``step`` seconds (of either sign), by classical Runge-Kutta."""
+    """Positions (n, D), m, some time later, by classical Runge-Kutta.
+
+    Args:
+        position: (n, D), m.
+        flow: what moves them.
+        time: s, when they are there.
+        step: s, of either sign.
+    """
     k1 = flow.velocity(position, time)
     k2 = flow.velocity(position + 0.5 * step * k1, time + 0.5 * step)
     k3 = flow.velocity(position + 0.5 * step * k2, time + 0.5 * step)
@@ -77,6 +107,15 @@ def carry(
 
     What flows in is what came from outside: uniform random candidates whose path back leaves the box. So a
     cloud that was uniform stays so, and no scatterer inside is disturbed.
+
+    Args:
+        cloud: at ``time``.
+        box: what is kept filled.
+        flow: what moves the scatterers.
+        time: s.
+        step: s.
+        density: scatterers per m^D.
+        generator: draws what flows in.
     """
     position = advance(cloud.position, flow, time, step)
     inside = box.contains(position)
@@ -100,11 +139,19 @@ def reseed(
     *,
     per_cell: float = 100.0,
 ) -> Cloud:
-    """Even out a density that a flow has changed (per m^D): new scatterers in thin cells, fewer in crowded
-    ones.
+    """Even out a density that a flow has changed: new scatterers in thin cells, fewer in crowded ones.
 
-    Cells hold ``per_cell`` scatterers on average. Only cells more than four Poisson deviations off are
-    brought back to the mean, so a uniform random cloud is left alone.
+    Only cells more than four Poisson deviations off are brought back to the mean, so a uniform random cloud is
+    left alone.
+
+    Args:
+        cloud: at ``time``.
+        box: what is kept filled.
+        flow: tells blood from tissue.
+        time: s.
+        density: scatterers per m^D.
+        generator: draws who leaves and who comes.
+        per_cell: scatterers in a cell on average.
     """
     cells = [max(1, round(side * (density / per_cell) ** (1 / len(box.sides)))) for side in box.sides]
     mean = density * box.volume / math.prod(cells)

@@ -14,15 +14,25 @@ from torch import Tensor
 
 from geometry import Grid
 
-from .acquisition import Acquisition, Beams
+from ..acquisition import Acquisition, Beams
 from .convolution import Convolution
 from .pointspread import SectorPointSpread
 
 
 class SectorImager:
-    """Forms images on a Cartesian ``grid`` from beams fanning out of ``beams.apex`` around its direction.
+    """Forms images on a Cartesian grid from beams fanning out of an apex around their direction.
 
-    Raises ValueError where the grid reaches the apex or what lies behind it.
+    Args:
+        grid: the image grid.
+        pointspread: how one scatterer looks, by depth.
+        acquisition: the wave.
+        beams: beams from an apex.
+        width: nodes per axis that a scatterer is spread over, see :class:`Gridding`.
+        dtype: precision of the samples' parts.
+        device: where images are formed.
+
+    Raises:
+        ValueError: where the beams are parallel, or the grid reaches the apex or what lies behind it.
     """
 
     def __init__(
@@ -38,9 +48,9 @@ class SectorImager:
     ) -> None:
         if beams.apex is None:
             raise ValueError("SectorImager needs beams from an apex; use ParallelImager for parallel beams")
-        self.grid, self.acquisition, self.beams = grid, acquisition, beams
+        self.grid, self.acquisition, self.beams, self._apex = grid, acquisition, beams, beams.apex
         nodes = grid.nodes(dtype=dtype).to(device)
-        if bool((((nodes - nodes.new_tensor(beams.apex)) @ nodes.new_tensor(beams.direction)) <= 0).any()):
+        if bool((((nodes - nodes.new_tensor(self._apex)) @ nodes.new_tensor(beams.direction)) <= 0).any()):
             raise ValueError(f"the image grid reaches behind the apex {beams.apex!r} of the beams")
         self._nodes = self._coordinates(nodes)
         along = (0.0,) * (grid.dimension - 1) + (1.0,)
@@ -55,7 +65,7 @@ class SectorImager:
 
     def _coordinates(self, points: Tensor) -> Tensor:
         """Direction cosines across and range, (n, D), of points (n, D), m."""
-        away = points - points.new_tensor(self.beams.apex)
+        away = points - points.new_tensor(self._apex)
         depth = away.norm(dim=1, keepdim=True)
         across = points.new_tensor(self.beams.across())
         return torch.cat([away @ across.T / depth, depth], 1)
@@ -67,13 +77,16 @@ class SectorImager:
         return coordinates[:, -1] ** (coordinates.shape[1] - 1) / cosine
 
     def image(self, points: Tensor, amplitude: Tensor) -> Tensor:
-        """IQ (*shape) of scatterers at ``points`` (n, D), m, with complex ``amplitude`` (n,).
+        """IQ (*shape) of scatterers: one of amplitude 1 gives h(b(x) - b(point)) exp(-i 4 pi f range / c).
 
-        A lone scatterer of amplitude 1 gives h(b(x) - b(point)) exp(-i 4 pi f range / c), b being the beam
-        coordinates.
+        b are the beam coordinates.
+
+        Args:
+            points: (n, D), m.
+            amplitude: (n,), complex.
         """
         place = self._coordinates(points)
-        ahead = (points - points.new_tensor(self.beams.apex)) @ points.new_tensor(self.beams.direction) > 0
+        ahead = (points - points.new_tensor(self._apex)) @ points.new_tensor(self.beams.direction) > 0
         near = ((place >= self._lower) & (place <= self._upper)).all(1) & ahead
         place, amplitude = place[near], amplitude[near]
         # range from the nearest one keeps the phase small, and so exact in float32

@@ -10,7 +10,7 @@ from torchsph import Scene, Simulator, preset
 from torchsph.pairs.smoothing_kernels import kernel
 from torchsph.simulator.scene import Valve
 from torchsph.simulator.walls.fields import WallFields
-from torchsph.simulator.walls.key_times import Moments
+from torchsph.simulator.walls.key_times import KeyTimes
 
 SPACING = 1e-3
 
@@ -37,7 +37,7 @@ def test_fields_follow_a_wall_that_moves_four_spacings_between_key_frames():
     """
     motion = swaying(np.arange(5) * 0.05)
     walls = WallFields(motion, SPACING, 1.0, kernel("wendland_c2"), 1.3, True, "cpu", torch.float64)
-    assert len(walls.moments.times) > 12
+    assert len(walls.key_times.times) > 12
     draw = np.random.default_rng(0)
     for time in (0.031, 0.088):
         surface = motion.surface(time)
@@ -46,7 +46,7 @@ def test_fields_follow_a_wall_that_moves_four_spacings_between_key_frames():
         points = surface.centroids[some] - surface.normals[some] * depth
         found = SurfaceIndex(surface).query(points)
         sign = np.where(geometry.winding_number(surface.vertices, surface.faces, points) > 0.5, 1, -1)
-        early, late, start, stop = walls.moments.bracket(time)
+        early, late, start, stop = walls.key_times.bracket(time)
         look = walls.between(walls.key(early, ()), walls.key(late, ()))
         seen = walls.sample(look, torch.tensor((time - start) / (stop - start)), torch.from_numpy(points / SPACING))
         assert np.abs(seen.distance.numpy() - sign * found.distance / SPACING).max() < 0.04
@@ -71,23 +71,23 @@ def test_key_frames_a_millisecond_apart_cost_no_field_each_where_the_wall_moves_
     drift = np.array([0.03, 0.0, 0.0])
     steady = geometry.WallMotion.through(times, body.vertices + times[:, None, None] * drift, body.faces, body.region)
     # 3 mm on the way: a field per millimetre
-    np.testing.assert_allclose(Moments(steady, SPACING).times, [0, 0.033, 0.066, 0.099, 0.1], atol=2e-3)
+    np.testing.assert_allclose(KeyTimes(steady, SPACING).times, [0, 0.033, 0.066, 0.099, 0.1], atol=2e-3)
     trembling = body.vertices + 3e-5 * np.sin(np.arange(101) * 2.4)[:, None, None]
     every = geometry.WallMotion.through(times, trembling, body.faces, body.region)
-    assert len(Moments(every, SPACING).times) > 90
+    assert len(KeyTimes(every, SPACING).times) > 90
 
 
 def test_a_beat_is_run_through_again_and_again():
-    moments = Moments(swaying(np.arange(5) * 0.05), SPACING)
-    early, late, start, stop = moments.bracket(0.083)
+    key_times = KeyTimes(swaying(np.arange(5) * 0.05), SPACING)
+    early, late, start, stop = key_times.bracket(0.083)
     for beats in (-1, 1, 7):
-        again = moments.bracket(0.083 + 0.2 * beats)
+        again = key_times.bracket(0.083 + 0.2 * beats)
         assert again[:2] == (early, late)
         assert again[2:] == pytest.approx((start + 0.2 * beats, stop + 0.2 * beats))
-        assert moments.wrapped(0.083 + 0.2 * beats) == pytest.approx(0.083)
-    one = [t for t in moments.times if 0.02 <= t <= 0.15]
-    assert moments.within(0.62, 0.75) == pytest.approx([t + 0.6 for t in one])
-    assert len(moments.within(0.0, 1.0)) == 5 * (len(moments.times) - 1) + 1
+        assert key_times.wrapped(0.083 + 0.2 * beats) == pytest.approx(0.083)
+    part = [t for t in key_times.times if 0.02 <= t <= 0.15]
+    assert key_times.within(0.62, 0.75) == pytest.approx([t + 0.6 for t in part])
+    assert len(key_times.within(0.0, 1.0)) == 5 * (len(key_times.times) - 1) + 1
 
 
 def breathing():
@@ -99,15 +99,15 @@ def breathing():
 
 
 def test_reservoirs_fill_the_second_beat_as_the_first():
-    reservoirs = Simulator(breathing()).domain.reservoirs
-    first = reservoirs.inflow(torch.tensor([0.05, 0.13, 0.3], dtype=torch.float64))
-    later = reservoirs.inflow(torch.tensor([0.45, 0.53, 1.5], dtype=torch.float64))
+    cavity = Simulator(breathing()).domain.valves.volume
+    first = cavity.rate(torch.tensor([0.05, 0.13, 0.3], dtype=torch.float64))
+    later = cavity.rate(torch.tensor([0.45, 0.53, 1.5], dtype=torch.float64))
     assert float(first.abs().min()) > 0
     torch.testing.assert_close(first, later)
 
 
 def test_pressure_sources_push_in_the_second_beat_as_in_the_first():
-    sources = Simulator(breathing(), preset("thesis")).domain.sources
+    sources = Simulator(breathing(), preset("thesis")).domain.valves
     assert sources.strength(0.53) == pytest.approx(sources.strength(0.13)) != 0.0
-    for which in (0, 1):
-        torch.testing.assert_close(sources._at(1, 0.53, which), sources._at(1, 0.13, which))
+    point = torch.tensor([[0.3, -0.2, 1.0]])
+    torch.testing.assert_close(sources._height(point, 1, 0.53), sources._height(point, 1, 0.13))

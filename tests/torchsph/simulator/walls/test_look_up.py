@@ -1,4 +1,4 @@
-"""Look-ups between two moments: SciPy's interpolation in space, linear in time, edges continued."""
+"""Look-ups between two times: SciPy's interpolation in space, linear in time, edges continued."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ from torchsph.simulator.walls.look_up import LookUp, by_node, rows_of
 
 
 @pytest.mark.parametrize("shape", [(7, 9), (6, 5, 8)], ids=["plane", "volume"])
-def test_values_are_those_of_scipy_between_two_moments(shape):
+def test_values_are_those_of_scipy_between_two_times(shape):
     generator = torch.Generator().manual_seed(3)
     d = len(shape)
     grid = Grid(origin=tuple(0.5 - k for k in range(d)), spacing=tuple(0.5 + 0.25 * k for k in range(d)), shape=shape)

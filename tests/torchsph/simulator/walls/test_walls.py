@@ -1,4 +1,4 @@
-"""Wall models: the kernel's share against analytic integrals, potential against autodiff, no slip per time."""
+"""Wall models: the kernel's completeness against analytic integrals, potential against autodiff, no slip per time."""
 
 import numpy as np
 import pytest
@@ -6,16 +6,17 @@ import torch
 
 import geometry
 from torchsph.pairs.smoothing_kernels import kernel
-from torchsph.simulator.schemes.weakly_compressible import CompleteKernelWall, PotentialWall
+from torchsph.simulator.schemes.wall_models import CompleteKernelWall, PotentialWall
 from torchsph.simulator.walls import closest as wall_closest
+from torchsph.simulator.walls.completeness import KernelCompleteness
 from torchsph.simulator.walls.fields import WallFields
-from torchsph.simulator.walls.forces import WallSample, potential, potential_force, retardation
-from torchsph.simulator.walls.kernel_share import KernelShare
+from torchsph.simulator.walls.interface import CompleteWallSample, WallSample
+from torchsph.simulator.walls.potential import damped_velocity, potential, potential_force
 
 WENDLAND = kernel("wendland_c2")
 
 
-def half_space_share(distance, h):
+def half_space_completeness(distance, h):
     """Integral of the kernel over the half-space x > -distance, by quadrature over plane slices (exact to 1e-6)."""
     support = WENDLAND.support * h
     x = torch.linspace(-support, support, 2001, dtype=torch.float64)
@@ -27,11 +28,11 @@ def half_space_share(distance, h):
     return float(torch.trapezoid(slices * keep, x)), float(np.interp(distance, x.numpy(), slices.numpy()))
 
 
-def kernel_share(field, step, h):
-    return KernelShare(field.shape, step, WENDLAND, h, torch.float64).at(field)
+def completeness_of(field, step, h):
+    return KernelCompleteness(field.shape, step, WENDLAND, h, torch.float64).at(field)
 
 
-def test_share_behind_a_tilted_plane_equals_the_analytic_half_space_integral():
+def test_completeness_behind_a_tilted_plane_equals_the_analytic_half_space_integral():
     """As looked up between the nodes: on the average over places within 0.2 % of the kernel, anywhere within 1 %.
 
     The gradient, which transmits the wall's friction: 1 and 3.5 % of its largest value. Values that are right at the
@@ -41,13 +42,13 @@ def test_share_behind_a_tilted_plane_equals_the_analytic_half_space_integral():
     normal = torch.tensor([0.36, 0.48, 0.8], dtype=torch.float64)
     axis = torch.arange(-7.0, 7.0 + step, step, dtype=torch.float64)
     grid = geometry.Grid((-7.0,) * 3, (step,) * 3, (len(axis),) * 3)
-    share, gradient = kernel_share((grid.nodes() @ normal).reshape(grid.shape), step, h)
+    completeness, gradient = completeness_of((grid.nodes() @ normal).reshape(grid.shape), step, h)
     aside = torch.rand((400, 3), generator=torch.Generator().manual_seed(0), dtype=torch.float64) * 4 - 2
     aside = aside - (aside @ normal)[:, None] * normal
-    largest = half_space_share(0.0, h)[1]
+    largest = half_space_completeness(0.0, h)[1]
     for distance in (0.0, 0.4, 1.0, 2.0):
-        values = grid.sample(torch.cat([share, gradient]), aside + distance * normal)
-        expected, slope = half_space_share(distance, h)
+        values = grid.sample(torch.cat([completeness, gradient]), aside + distance * normal)
+        expected, slope = half_space_completeness(distance, h)
         assert float(values[0].mean()) == pytest.approx(expected, abs=0.002)
         assert (values[0] - expected).abs().max() < 0.01
         along = normal @ values[1:]
@@ -56,7 +57,7 @@ def test_share_behind_a_tilted_plane_equals_the_analytic_half_space_integral():
         assert (values[1:] - along * normal[:, None]).abs().max() < 0.035 * largest
 
 
-def test_share_in_a_right_angled_edge_is_a_quarter():
+def test_completeness_in_a_right_angled_edge_is_a_quarter():
     """Within 3 %: the cell that holds the edge counts as cut by one plane."""
     h, step = 1.3, 0.5
     axis = torch.arange(-6.0, 6.0 + step, step, dtype=torch.float64)
@@ -64,10 +65,10 @@ def test_share_in_a_right_angled_edge_is_a_quarter():
     inside = torch.minimum(x, z)
     beyond = -torch.sqrt(x.clamp_max(0) ** 2 + z.clamp_max(0) ** 2)
     field = torch.where(inside > 0, inside, beyond).expand(-1, 9, -1)
-    share, _ = kernel_share(field, step, h)
+    completeness, _ = completeness_of(field, step, h)
     corner = int((axis == 0).nonzero())
-    assert float(share[0, corner, 4, corner]) == pytest.approx(0.25, abs=0.03)
-    assert float(share[0, -1, 4, -1]) == pytest.approx(1.0, abs=1e-9)
+    assert float(completeness[0, corner, 4, corner]) == pytest.approx(0.25, abs=0.03)
+    assert float(completeness[0, -1, 4, -1]) == pytest.approx(1.0, abs=1e-9)
 
 
 def wall(distance, velocity=(0.0, 0.0, 0.0)):
@@ -89,14 +90,14 @@ def test_retardation_is_relative_to_the_wall_and_independent_of_the_step():
     """Errata to 3.2: n small steps do what one step of n times the length does; normal velocity stays."""
     model, at = PotentialWall(relaxation=0.7), wall([0.2], (0.5, 0.0, 0.3))
     start = torch.tensor([[2.0, -1.0, 0.9]], dtype=torch.float64)
-    once = retardation(model, 1.5, torch.tensor([0.4], dtype=torch.float64), start, at)
-    many = start
+    once = damped_velocity(model, 1.5, torch.tensor([0.4], dtype=torch.float64), start, at)
+    stepped = start
     for _ in range(8):
-        many = retardation(model, 1.5, torch.tensor([0.05], dtype=torch.float64), many, at)
-    torch.testing.assert_close(once, many)
+        stepped = damped_velocity(model, 1.5, torch.tensor([0.05], dtype=torch.float64), stepped, at)
+    torch.testing.assert_close(once, stepped)
     assert float(once[0, 2]) == 0.9
     assert 0.5 < float(once[0, 0]) < 2.0
-    torch.testing.assert_close(retardation(model, 1.5, torch.ones(1).double(), at.velocity, at), at.velocity)
+    torch.testing.assert_close(damped_velocity(model, 1.5, torch.ones(1).double(), at.velocity, at), at.velocity)
 
 
 def fields(surface, spacing=1e-3, model=None):
@@ -112,15 +113,16 @@ def test_look_up_fields_of_a_box_are_exact_near_its_sides():
     seen = made.sample(made.between(key, key), torch.zeros(()).double(), points)
     torch.testing.assert_close(seen.distance, torch.tensor([0.3, -0.4, 0.7]).double(), atol=1e-6, rtol=0)
     torch.testing.assert_close(seen.normal[0], torch.tensor([0.0, 0, 1]).double(), atol=1e-6, rtol=0)
-    assert seen.share is not None
-    assert float(seen.share[0]) == pytest.approx(half_space_share(0.3, 1.3)[0], abs=0.012)
+    assert isinstance(seen, CompleteWallSample)
+    assert float(seen.completeness[0]) == pytest.approx(half_space_completeness(0.3, 1.3)[0], abs=0.012)
 
 
-def test_potential_walls_store_no_kernel_share():
+def test_potential_walls_store_no_completeness_of():
     made = fields(geometry.box((0, 0, 0), (0.02, 0.012, 0.012), 2e-3), model=PotentialWall())
     key = made.key(0, ())
     assert key.shape[0] == 7
-    assert made.sample(made.between(key, key), torch.zeros(()).double(), torch.ones(1, 3).double()).share is None
+    seen = made.sample(made.between(key, key), torch.zeros(()).double(), torch.ones(1, 3).double())
+    assert not isinstance(seen, CompleteWallSample)
 
 
 def test_an_open_orifice_is_no_wall():
@@ -136,9 +138,9 @@ def test_an_open_orifice_is_no_wall():
     assert float(made.sample(made.between(shut, shut), zero, above).distance) < 0
     assert float(made.sample(made.between(opened, opened), zero, above).distance) > 1.5
     assert (
-        float(made.sample(made.between(opened, opened), zero, centre).share)
+        float(made.sample(made.between(opened, opened), zero, centre).completeness)
         > 0.9
-        > float(made.sample(made.between(shut, shut), zero, centre).share)
+        > float(made.sample(made.between(shut, shut), zero, centre).completeness)
     )
 
 
@@ -200,9 +202,9 @@ def test_walls_that_bound_no_fluid_are_refused(fault):
 
 def test_walls_that_touch_themselves_bound_both_their_rooms():
     """Two boxes with a side in common: it is wall for both, and the distance is right on either side of it."""
-    one, other = (geometry.box((x, 0, 0), (x + 0.012, 0.012, 0.012), 2e-3) for x in (0.0, 0.012))
+    left, right = (geometry.box((x, 0, 0), (x + 0.012, 0.012, 0.012), 2e-3) for x in (0.0, 0.012))
     both = geometry.Surface(
-        np.concatenate([one.vertices, other.vertices]), np.concatenate([one.faces, other.faces + len(one.vertices)])
+        np.concatenate([left.vertices, right.vertices]), np.concatenate([left.faces, right.faces + len(left.vertices)])
     )
     made = fields(both)
     key = made.key(0, ())

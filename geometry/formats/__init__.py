@@ -1,0 +1,26 @@
+"""From the files of a lab to recordings, and from recordings to the files of its viewers."""
+
+from .convert import Converted, WallOptions, convert
+from .export import EXPORTS, export
+from .field_map import FieldMap, read_field_map
+from .labelled_arrays import from_xarray, to_xarray
+from .registry import FORMATS, Format
+from .source import FormatError
+from .writers.vtkhdf import PolySeries, write_sidecar
+
+__all__ = [
+    "EXPORTS",
+    "FORMATS",
+    "Converted",
+    "FieldMap",
+    "Format",
+    "FormatError",
+    "PolySeries",
+    "WallOptions",
+    "convert",
+    "export",
+    "from_xarray",
+    "read_field_map",
+    "to_xarray",
+    "write_sidecar",
+]

@@ -1,0 +1,316 @@
+"""From the arrays of a file and a field map to the fields of a recording, one frame at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from geometry.grids.grid import Grid
+from geometry.recordings.units import factor
+
+from .field_map import FieldMap
+from .orientation import Orientation
+from .source import ArrayLike, FormatError, Source
+
+MIRROR = {"ras": np.array([-1.0, -1.0, 1.0])}  # to LPS, the coordinates that DICOM, ITK and surfaces of Slicer use
+DECLARED = 64 * 2**30  # bytes; a file that claims a larger result is refused before anything is read
+
+
+@dataclass(frozen=True, eq=False)
+class Fields:
+    """What a recording takes over, and what its user should know about it.
+
+    Attributes:
+        grid: of all fields.
+        time: (T,), s.
+        velocity: (T, D, *grid), m/s, float32; NaN where the file has no value.
+        mask: (T, *grid) or None.
+        weight: (T, *grid) or None; `sigma` as the velocity, or None.
+        turn: (D, D), rotation from the recording's coordinates to the file's; walls are turned back by it.
+        notes: sentences for the user.
+    """
+
+    grid: Grid
+    time: np.ndarray
+    velocity: np.ndarray
+    mask: np.ndarray | None
+    weight: np.ndarray | None
+    sigma: np.ndarray | None
+    turn: np.ndarray
+    notes: list[str] = field(default_factory=list)
+
+
+def assemble(source: Source, said: FieldMap) -> Fields:
+    """The fields of a file, in SI units, in the order and sense of a recording's axes.
+
+    Raises:
+        FormatError: an array is missing or of the wrong shape, or what is not known is not said.
+    """
+    names = _velocity_names(source, said)
+    axes = [_axes(source, said, name, len(names) == 1) for name in names]
+    sizes = [dict(zip(a, source.arrays[n].shape, strict=True)) for a, n in zip(axes, names, strict=True)]
+    dimension = 3 if "z" in axes[0] else 2
+    _check_components(source, names, sizes, dimension)
+    counts = tuple(sizes[0][letter] for letter in "xyz"[:dimension])
+    frames = sizes[0].get("t", 1)
+    if 4 * dimension * frames * int(np.prod(counts)) > DECLARED:
+        raise FormatError(
+            f"{source.path}: {names[0]}: claims {frames} frames of {counts} nodes, more than memory holds"
+        )
+    lie = Orientation.of(_affine(source, said, counts), counts, source.path)
+    grid = Grid(tuple(lie.origin), tuple(lie.spacing), tuple(counts[lie.order[a]] for a in reversed(range(dimension))))
+    matrix = _matrix(source, said, lie)
+    unit = said.unit("velocity") or source.velocity_unit
+    velocity = np.empty((frames, dimension, *grid.shape), np.float32)
+    _fill(velocity, source, names, axes, lie, matrix, unit)
+    sigma = None
+    if said.sigma:
+        sigma = np.empty_like(velocity)
+        _fill(
+            sigma,
+            source,
+            said.sigma,
+            [_axes(source, said, n, len(said.sigma) == 1) for n in said.sigma],
+            lie,
+            np.abs(matrix),
+            unit,
+        )
+    scalar = {
+        name: _scalar(source, said, getattr(said, name) or _role(source, name), lie, frames, grid)
+        for name in ("mask", "weight")
+    }
+    mask = scalar["mask"]
+    if mask is not None:
+        mask = mask == said.mask_label if said.mask_label is not None else mask > said.mask_threshold
+    notes = _notes(source, said, lie, unit)
+    return Fields(grid, _time(source, said, frames), velocity, mask, scalar["weight"], sigma, lie.turn, notes)
+
+
+def _role(source: Source, name: str) -> str:
+    return next(iter(source.roles.get(name, ())), "")
+
+
+def _velocity_names(source: Source, said: FieldMap) -> tuple[str, ...]:
+    names = tuple(said.velocity) or tuple(source.roles.get("velocity", ()))
+    listed = ", ".join(f"{name} {tuple(array.shape)}" for name, array in source.arrays.items()) or "none"
+    if not names:
+        raise FormatError(
+            f"{source.path}: which arrays are the velocity? Name them (--velocity u,v,w); it holds {listed}"
+        )
+    missing = [name for name in (*names, *said.sigma, said.mask, said.weight) if name and name not in source.arrays]
+    if missing:
+        raise FormatError(f"{source.path}: has no array {', '.join(missing)}; it holds {listed}")
+    return names
+
+
+def _axes(source: Source, said: FieldMap, name: str, vector: bool) -> str:
+    """The meaning of the axes of an array, a letter each, in array order."""
+    shape = source.arrays[name].shape
+    known = source.axes.get(name, "")
+    if len(known) == len(shape) and not (said.axes and said.axes != "auto"):
+        return known
+    space = said.axes if said.axes and said.axes != "auto" else "zyx"[max(0, 3 - len(shape)) :]
+    if len(space) > len(shape):
+        space = "".join(letter for letter in space if letter in "xyz" or len(shape) == len(said.axes))
+    left = len(shape) - len(space)
+    if vector and "c" not in space and left > 0:
+        components = [0, left - 1, len(shape) - 1] if "t" not in space else [0, len(shape) - 1]
+        fits = [place for place in dict.fromkeys(components) if shape[place] in (2, 3)]
+        if len(fits) == 1:
+            rest = len(shape) - len(space) - 1
+            lead = "t" * min(rest, 1)
+            space = (
+                lead + space + "c"
+                if fits[0] == len(shape) - 1
+                else "".join(["c" if place == fits[0] else "t" for place in range(left)]) + space
+            )
+    elif left == 1 and "t" not in space:
+        space = "t" + space
+    if len(space) != len(shape):
+        raise FormatError(
+            f"{source.path}: {name}: what do the axes of its shape {tuple(shape)} mean? Say it with a letter for each "
+            "of t, c, x, y, z in that order (--axes tczyx)"
+        )
+    return space
+
+
+def _check_components(source: Source, names: Sequence[str], sizes: list[dict[str, int]], dimension: int) -> None:
+    first = {letter: size for letter, size in sizes[0].items() if letter != "c"}
+    for name, size in zip(names, sizes, strict=True):
+        if {letter: count for letter, count in size.items() if letter != "c"} != first:
+            raise FormatError(f"{source.path}: {name} has the shape {size}, but {names[0]} has {sizes[0]}")
+    count = sizes[0].get("c", 1) * len(names)
+    if count != dimension and (dimension, count, len(names)) != (2, 3, 1):  # a plane of vectors in space: its z is left
+        raise FormatError(
+            f"{source.path}: {dimension} components of velocity are needed, not {count} ({', '.join(names)})"
+        )
+
+
+def _affine(source: Source, said: FieldMap, counts: tuple[int, ...]) -> np.ndarray:
+    """From node numbers to places in metres, in LPS where the file is of a patient."""
+    dimension = len(counts)
+    affine = None if source.affine is None else np.array(source.affine, np.float64)
+    if affine is not None and len(affine) == 4 and dimension == 2:
+        affine = affine[np.ix_([0, 1, 3], [0, 1, 3])]
+    unit = said.unit("length") or source.length
+    if said.spacing or affine is None:
+        spacing = _spacing(source, said, dimension)
+        start = said.origin or (0.0,) * dimension
+        if affine is not None:
+            turned = affine[:-1, :-1] / np.linalg.norm(affine[:-1, :-1], axis=0)
+            affine[:-1, :-1] = turned * spacing
+        else:
+            affine = np.eye(dimension + 1)
+            affine[:-1, :-1], affine[:-1, -1] = np.diag(spacing), start
+    elif said.origin:
+        affine[:-1, -1] = said.origin
+    if unit is None:
+        raise FormatError(f"{source.path}: in which unit are its lengths? Say it (--length-unit mm)")
+    affine[:-1] *= unit
+    if source.world in MIRROR:
+        affine[:-1] *= MIRROR[source.world][:, None]
+    return affine
+
+
+def _spacing(source: Source, said: FieldMap, dimension: int) -> np.ndarray:
+    if not said.spacing:
+        raise FormatError(f"{source.path}: how far are its nodes apart? Say it (--spacing 1.2 or --spacing DATASET)")
+    if isinstance(said.spacing, str):
+        if said.spacing not in source.arrays:
+            raise FormatError(f"{source.path}: has no array {said.spacing} of spacings")
+        array = source.arrays[said.spacing]
+        if int(np.prod(array.shape)) > 1000:
+            raise FormatError(f"{source.path}: {said.spacing}: has the shape {array.shape}, too large for spacings")
+        values = np.asarray(array[(...,)], np.float64).reshape(-1)
+        values = values[:dimension] if len(values) % dimension == 0 else values[:1]
+    else:
+        values = np.asarray(said.spacing, np.float64)
+    if len(values) not in (1, dimension):
+        raise FormatError(f"{source.path}: spacing must be 1 or {dimension} numbers, not {values.tolist()}")
+    return np.broadcast_to(values, (dimension,))
+
+
+def _matrix(source: Source, said: FieldMap, lie: Orientation) -> np.ndarray:
+    """(D, D): recorded components from the stored ones."""
+    dimension = len(lie.order)
+    stored = np.eye(dimension)
+    if said.components:
+        stored = np.zeros((dimension, dimension))
+        for place, word in enumerate(said.components.replace(" ", "").split(",")):
+            letter = word.lstrip("+-")
+            if letter not in "xyz"[:dimension] or not letter or place >= dimension:
+                raise FormatError(
+                    f"components: must be {dimension} of x, y, z with signs, as -y,x,z, not {said.components}"
+                )
+            stored["xyz".index(letter), place] = -1.0 if word.startswith("-") else 1.0
+        if abs(abs(np.linalg.det(stored)) - 1) > 1e-9:
+            raise FormatError(f"components: must name each axis once, not {said.components}")
+    if said.image_components:
+        return lie.components() @ stored
+    world = np.diag(MIRROR[source.world][:dimension]) if source.world in MIRROR else np.eye(dimension)
+    return lie.turn.T @ world @ stored
+
+
+def _fill(
+    result: np.ndarray,
+    source: Source,
+    names: Sequence[str],
+    axes: Sequence[str],
+    lie: Orientation,
+    matrix: np.ndarray,
+    unit: float | None,
+) -> None:
+    """Write a vector field into `result`, (T, D, *grid), frame by frame and component by component."""
+    result[...] = 0
+    for frame in range(len(result)):
+        for component in range(result.shape[1]):
+            name, letters = (names[0], axes[0]) if len(names) == 1 else (names[component], axes[component])
+            values = lie.field(_slab(source, name, letters, frame, component))
+            values = values * (unit or _stated(source, name))
+            for axis in np.flatnonzero(matrix[:, component]):
+                result[frame, axis] += np.asarray(matrix[axis, component] * values, np.float32)
+
+
+def _slab(source: Source, name: str, letters: str, frame: int, component: int) -> np.ndarray:
+    """One frame of one component, indexed [k, j, i], unpacked, NaN where the file has a fill value."""
+    array: ArrayLike = source.arrays[name]
+    place = {"t": frame, "c": component}
+    values = np.asarray(array[tuple(place.get(letter, slice(None)) for letter in letters)])
+    space = [letter for letter in letters if letter in "xyz"]
+    values = np.transpose(values, [space.index(letter) for letter in "zyx" if letter in space])
+    about = source.attributes.get(name, {})
+    number = {
+        key: float(np.asarray(about[key]).reshape(-1)[0])
+        for key in ("scale_factor", "add_offset", "_FillValue")
+        if key in about
+    }
+    plain = values.astype(np.float32) if values.dtype != np.float64 else values
+    if "scale_factor" in number or "add_offset" in number:
+        plain = values * number.get("scale_factor", 1.0) + number.get("add_offset", 0.0)
+    return np.where(values == number["_FillValue"], np.nan, plain) if "_FillValue" in number else plain
+
+
+def _stated(source: Source, name: str) -> float:
+    """m/s per unit, from the array's attribute `units`; 1 where there is none."""
+    units = source.attributes.get(name, {}).get("units")
+    if units is None or str(units).strip() == "":
+        return 1.0
+    try:
+        return factor(units.decode() if isinstance(units, bytes) else str(units), "velocity")
+    except ValueError as fault:
+        raise FormatError(f"{source.path}: {name}: its attribute units: {fault} (--velocity-unit)") from fault
+
+
+def _scalar(source: Source, said: FieldMap, name: str, lie: Orientation, frames: int, grid: Grid) -> np.ndarray | None:
+    if not name:
+        return None
+    letters = _axes(source, said, name, False)
+    many = letters.find("t") >= 0 and source.arrays[name].shape[letters.find("t")] > 1
+    count = frames if many else 1
+    result = np.empty((frames, *grid.shape), np.float32)
+    for frame in range(count):
+        values = lie.field(_slab(source, name, letters, frame, 0))
+        if values.shape != grid.shape:
+            raise FormatError(f"{source.path}: {name} has {values.shape} nodes (z, y, x), the velocity {grid.shape}")
+        result[frame] = values
+    result[count:] = result[0]
+    return result
+
+
+def _time(source: Source, said: FieldMap, frames: int) -> np.ndarray:
+    unit = said.unit("time") or 1.0
+    time: np.ndarray
+    if isinstance(said.time, tuple) and said.time:
+        time = np.asarray(said.time, np.float64) * unit
+    elif said.time:
+        name = str(said.time)
+        if name not in source.arrays:
+            raise FormatError(f"{source.path}: has no array {name} of times")
+        time = np.asarray(source.arrays[name][(...,)], np.float64).reshape(-1) * unit
+    elif said.interval is not None:
+        time = said.interval * np.arange(frames)
+    elif source.time is not None:
+        time = np.asarray(source.time, np.float64) * (unit if said.time_unit else 1.0)
+    elif said.period > 0:
+        time = said.period * np.arange(frames) / frames
+    elif frames == 1:
+        time = np.zeros(1)
+    else:
+        raise FormatError(
+            f"{source.path}: when were its {frames} frames? Say it (--interval S, --period S or --time NAME)"
+        )
+    if len(time) != frames:
+        raise FormatError(f"{source.path}: {len(time)} times for {frames} frames")
+    return time
+
+
+def _notes(source: Source, said: FieldMap, lie: Orientation, unit: float | None) -> list[str]:
+    notes = []
+    if (lie.turn != np.eye(len(lie.order))).any():
+        rows = "; ".join(", ".join(f"{value:.6g}" for value in row) for row in lie.turn)
+        notes.append(f"axes of the image kept; file coordinates = [{rows}] @ recorded ones")
+    if source.world in MIRROR:
+        notes.append("coordinates are LPS, as of DICOM")
+    return notes

@@ -1,0 +1,321 @@
+"""From a lab's files to a recording: read, placed, put in SI units, walled and checked."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from geometry.grids.grid import Grid
+from geometry.recordings.field_checks import FACTOR, best_order
+from geometry.recordings.read import read_recording
+from geometry.recordings.recording import Recording, Wall
+from geometry.recordings.units import factor
+from geometry.surfaces.files import SUFFIXES
+
+from .assemble import Fields, assemble
+from .field_map import FieldMap
+from .readers.hdf5 import text
+from .registry import open_source
+from .source import FormatError, Source
+from .walls import inside_at, wall_from_files, wall_from_mask
+
+ORDERS = ("zyx", "xyz", "yxz", "zxy", "xzy", "yzx")
+
+
+@dataclass(frozen=True)
+class WallOptions:
+    """Where the wall comes from.
+
+    Attributes:
+        files: surfaces, one, or one for each frame in order of time; none: a wall around the mask.
+        unit: of the files, a name or a number of metres.
+        openings: how many of the longest holes of the files are orifices, regions 1, 2, ...
+        unite: bodies that overlap become one.
+        smoothing: passes of Taubin's filter over a wall from a mask.
+    """
+
+    files: tuple[str, ...] = ()
+    unit: str = ""
+    openings: int = 0
+    unite: bool = False
+    smoothing: int = 0
+
+    def scale(self, said: FieldMap) -> float:
+        """Metres per unit of the files; that of the fields where the wall's is not said."""
+        if self.unit:
+            return factor(self.unit, "length")
+        return said.unit("length") or 1.0
+
+
+@dataclass(frozen=True)
+class _Constants:
+    """kg/m^3, Pa s and s of the recording to be made."""
+
+    rho: float
+    mu: float
+    period: float
+
+
+@dataclass(frozen=True)
+class Converted:
+    """A recording, and what its user should know of how it was made."""
+
+    recording: Recording
+    notes: tuple[str, ...] = ()
+
+
+def convert(
+    inputs: Sequence[str | Path],
+    said: FieldMap | None = None,
+    *,
+    format: str = "",
+    wall: WallOptions | None = None,
+    rho: float = 1060.0,
+    mu: float = 0.004,
+    description: str = "",
+) -> Converted:
+    """A recording from files of velocity, of walls, or both.
+
+    Args:
+        inputs: files of one velocity series (arrays spread over several files, or a file for each frame), or
+            surfaces alone, whose inside then becomes a recording in which nothing was measured.
+        said: what the files do not say.
+        format: name of the format, else the ends of the names tell.
+        wall: where the wall comes from.
+        rho: kg/m^3.
+        mu: Pa s.
+        description: of the recording.
+
+    Raises:
+        FileNotFoundError: a file is not there.
+        FormatError: a file cannot be understood; the text says what is missing.
+        RecordingError: the result breaks a rule of the recording file.
+    """
+    said, wall = said or FieldMap(), wall or WallOptions()
+    paths = [Path(name) for name in inputs]
+    if not paths:
+        raise FormatError("convert: no file is named")
+    missing = [path for path in (*paths, *map(Path, wall.files)) if not path.exists()]
+    if missing:
+        raise FileNotFoundError(f"{missing[0]}: there is no such file")
+    about = _Constants(rho, mu, said.period)
+    text_of = description or f"converted from {paths[0].name}" + (
+        f" and {len(paths) - 1} more" if len(paths) > 1 else ""
+    )
+    if not format and all(path.suffix.lower() in SUFFIXES for path in paths):
+        return _walls_alone(paths, said, wall, about, text_of)
+    if len(paths) == 1 and not format and _is_recording(paths[0]):
+        return Converted(read_recording(paths[0]))
+    fields = _fields(paths, said, format)
+    return _walled(fields, said, wall, about, text_of)
+
+
+def _is_recording(path: Path) -> bool:
+    if not path.is_file() or not h5py.is_hdf5(path):
+        return False
+    with h5py.File(path, "r") as file:
+        return text(file.attrs.get("format", "")) == "recording"
+
+
+def _fields(paths: Sequence[Path], said: FieldMap, format: str) -> Fields:
+    """The fields of all files, with the order of axes of least divergence where that is asked for."""
+    sources = [open_source(path, said, format) for path in paths]
+    try:
+        if len(sources) == 1:
+            return _ordered(sources[0], said)
+        together = _merged(sources, said)
+        if together is not None:
+            return _ordered(together, said)
+        return _joined(
+            [
+                _ordered(source, replace(said, interval=None, time=(0.0,)) if _timeless(source) else said)
+                for source in sources
+            ],
+            said,
+            [str(path) for path in paths],
+        )
+    finally:
+        for source in sources:
+            source.close()
+
+
+def _timeless(source: Source) -> bool:
+    return source.time is None
+
+
+def _ordered(source: Source, said: FieldMap) -> Fields:
+    """Assembled; with `axes="auto"` in the order of axes that has the least divergence."""
+    if said.axes != "auto":
+        return assemble(source, said)
+    # Spacings belong to x, y, z, so that each order is another field: all are tried, and only their scores kept.
+    scores = {axes: _divergence(source, replace(said, axes=axes)) for axes in ORDERS}
+    axes = min(scores, key=lambda one: scores[one])
+    if scores["zyx"] <= FACTOR * scores[axes]:
+        axes = "zyx"
+    fields = assemble(source, replace(said, axes=axes))
+    rest = ", ".join(f"{one} {score:.2g}" for one, score in scores.items() if one != axes)
+    fields.notes.append(f"axes taken as {axes}: divergence {scores[axes]:.2g} of the gradient ({rest})")
+    return fields
+
+
+def _divergence(source: Source, said: FieldMap) -> float:
+    """The RMS of the divergence relative to that of the gradient."""
+    fields = assemble(source, said)
+    mask = fields.mask if fields.mask is not None else np.isfinite(fields.velocity).all(axis=1)
+    bare = Wall(np.eye(4, 3), np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]]), np.zeros(4))
+    found = best_order(Recording(fields.time, fields.grid, np.nan_to_num(fields.velocity), mask, bare, 1060.0, 0.0))
+    if found is None:
+        raise FormatError(f"{source.path}: too little is measured to find the order of axes; say it (--axes zyx)")
+    return found[1]
+
+
+def _merged(sources: Sequence[Source], said: FieldMap) -> Source | None:
+    """All arrays of several files as of one, where the field map names arrays that lie in different ones."""
+    arrays = {name: (source, array) for source in sources for name, array in source.arrays.items()}
+    wanted = [name for name in (*said.velocity, said.mask, said.weight, *said.sigma) if name]
+    if sum(len(source.arrays) for source in sources) != len(arrays) or not wanted:
+        return None
+    if all(name in sources[0].arrays for name in wanted) or not all(name in arrays for name in wanted):
+        return None
+    first = next(source for source in sources if wanted[0] in source.arrays)
+    for source in sources:
+        if (
+            first.affine is not None
+            and source.affine is not None
+            and not (
+                source.affine.shape == first.affine.shape
+                and np.allclose(source.affine, first.affine, rtol=1e-4, atol=1e-4)
+            )
+        ):
+            raise FormatError(f"{source.path}: lies elsewhere than {first.path}; resample it to the same grid")
+
+    def gathered(of: str) -> dict:
+        merged: dict = {}
+        for source in sources:
+            merged |= dict(getattr(source, of))
+        return merged
+
+    return replace(
+        first,
+        arrays={name: array for name, (_, array) in arrays.items()},
+        attributes=gathered("attributes"),
+        axes=gathered("axes"),
+        roles=gathered("roles"),
+    )
+
+
+def _joined(parts: Sequence[Fields], said: FieldMap, names: Sequence[str]) -> Fields:
+    """The frames of several files in a row."""
+    first = parts[0]
+    for part, name in zip(parts, names, strict=True):
+        if part.grid.shape != first.grid.shape or not np.allclose(part.grid.origin, first.grid.origin, atol=1e-9):
+            raise FormatError(f"{name}: has another grid than {names[0]}; the frames of a series share theirs")
+
+    def row(of: str) -> np.ndarray | None:
+        values = [getattr(part, of) for part in parts]
+        return None if any(value is None for value in values) else np.concatenate(values)
+
+    time = np.concatenate([part.time for part in parts])
+    if isinstance(said.time, tuple) and said.time:
+        time = np.asarray(said.time) * (said.unit("time") or 1.0)
+    elif said.interval is not None:
+        time = said.interval * np.arange(len(time))
+    elif (np.diff(time) <= 0).any():
+        if not said.period:
+            raise FormatError(f"{names[0]}: when were the {len(time)} frames? Say it (--interval S or --period S)")
+        time = said.period * np.arange(len(time)) / len(time)
+    return replace(
+        first,
+        time=time,
+        velocity=np.concatenate([part.velocity for part in parts]),
+        mask=row("mask"),
+        weight=row("weight"),
+        sigma=row("sigma"),
+    )
+
+
+def _walled(fields: Fields, said: FieldMap, options: WallOptions, about: _Constants, description: str) -> Converted:
+    """A recording of the fields between a wall from files, or one around the mask."""
+    notes, grid, velocity, mask = list(fields.notes), fields.grid, fields.velocity, fields.mask
+    known = np.isfinite(velocity).all(axis=1)
+    wall = None
+    if options.files:
+        files = [Path(name) for name in options.files]
+        turn = None if (fields.turn == np.eye(grid.dimension)).all() else fields.turn
+        wall = wall_from_files(files, options.scale(said), openings=options.openings, unite=options.unite, turn=turn)
+        if wall.moves and len(wall.vertices) != len(fields.time):
+            raise FormatError(f"{files[0]}: {len(files)} walls for {len(fields.time)} frames of velocity")
+    if mask is None and wall is not None:
+        mask = np.stack([inside_at(wall, frame, grid) for frame in range(len(fields.time))])
+        notes.append("no mask is named: the inside of the wall is taken")
+    elif mask is None:
+        moving = (known & (np.abs(np.nan_to_num(velocity)).max(axis=1) > 0)).any(axis=0)
+        mask = np.broadcast_to(moving, known.shape)
+        notes.append("no mask is named: nodes that ever move are taken as blood")
+    if wall is None:
+        wall = wall_from_mask(mask, grid, smoothing=options.smoothing)
+        labels = sorted(set(np.unique(wall.region).tolist()) - {0})
+        notes.append(f"wall at rest around the mask, openings where the grid cuts it: regions {labels or 'none'}")
+        kept = mask & inside_at(wall, 0, grid)
+        if kept.sum() < mask.sum():
+            notes.append(
+                f"{int(mask.sum() - kept.sum())} of {int(mask.sum())} nodes of the mask lie apart and are left out"
+            )
+        mask = kept
+    weight = fields.weight
+    unknown = mask & ~known
+    if unknown.any():
+        weight = np.where(known, 1.0 if weight is None else weight, 0.0)
+        notes.append(f"{int(unknown.sum())} nodes in the mask have no value: weight 0")
+    recording = Recording(
+        fields.time,
+        grid,
+        velocity,
+        mask,
+        wall,
+        description=description + "".join(f"; {note}" for note in fields.notes),
+        weight=weight,
+        sigma=fields.sigma,
+        rho=about.rho,
+        mu=about.mu,
+        period=about.period,
+    )
+    return Converted(recording, tuple(notes))
+
+
+def _walls_alone(
+    paths: Sequence[Path], said: FieldMap, options: WallOptions, about: _Constants, description: str
+) -> Converted:
+    """A recording of a wall in which nothing was measured: velocity 0 at weight 0."""
+    if said.grid_spacing is None:
+        raise FormatError(
+            f"{paths[0]}: on which grid is its inside wanted? Say its spacing in m (--grid-spacing 0.002)"
+        )
+    if options.files:
+        raise FormatError(f"{paths[0]}: is a surface itself; name files of velocity before --wall")
+    wall = wall_from_files(paths, options.scale(said), openings=options.openings, unite=options.unite)
+    count = len(paths)
+    if count > 1 and said.interval is None and not said.period:
+        raise FormatError(f"{paths[0]}: when were the {count} walls? Say it (--interval S or --period S)")
+    step = said.interval if said.interval is not None else said.period / count
+    points = wall.vertices.reshape(-1, 3)
+    grid = Grid.covering(tuple(points.min(axis=0)), tuple(points.max(axis=0)), said.grid_spacing)
+    mask = np.stack([inside_at(wall, frame if wall.moves else 0, grid) for frame in range(count)])
+    recording = Recording(
+        step * np.arange(count),
+        grid,
+        np.zeros((count, 3, *grid.shape), np.float32),
+        mask,
+        wall,
+        description=f"{description}; walls alone, nothing measured",
+        weight=np.zeros(mask.shape),
+        rho=about.rho,
+        mu=about.mu,
+        period=about.period,
+    )
+    volume = [wall.at(frame).volume for frame in range(count)] if wall.moves else [wall.at(0).volume]
+    return Converted(recording, (f"walls alone, {1e6 * min(volume):.4g} to {1e6 * max(volume):.4g} ml; weight 0",))

@@ -1,0 +1,211 @@
+"""VTKHDF by h5py alone: the grid's fields, the moving wall and particles, each as one temporal file.
+
+The layout is that of version 2 of the format ("VTKHDF file format", VTK documentation): image data with time
+as the first axis, polygonal data with the parts of all times in a row.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from types import TracebackType
+
+import h5py
+import numpy as np
+
+from geometry.recordings.recording import Recording
+
+from .common import SCALARS, VECTORS, lattice, scalar, vector, wall_velocity
+
+TOPOLOGIES = ("Vertices", "Lines", "Polygons", "Strips")
+
+
+def write_vtkhdf(path: Path, recording: Recording) -> list[Path]:
+    """The fields of the grid to `path`, the wall beside it as `NAME_wall.vtkhdf`."""
+    with h5py.File(path, "w") as file:
+        points = _image(file, recording)
+        for name in VECTORS:
+            field = vector(recording, name)
+            if field is not None:
+                _store(points, name, np.moveaxis(field, 1, -1), recording.dimension)
+        for name in SCALARS:
+            values = scalar(recording, name)
+            if values is not None:
+                _store(points, name, values, recording.dimension)
+        _steps(file["VTKHDF"], recording.time, list(points))
+    return [path, *_wall(path, recording)]
+
+
+def write_sidecar(recording_file: str | Path) -> list[Path]:
+    """VTKHDF files beside a recording's file that show its data without a copy, by virtual datasets.
+
+    Args:
+        recording_file: a file that `write_recording` wrote; the sidecar must stay beside it.
+
+    Returns:
+        The files written: `NAME.vtkhdf` for the fields, `NAME_wall.vtkhdf` for the wall.
+    """
+    from geometry.recordings.read import read_recording
+
+    source = Path(recording_file)
+    recording = read_recording(source)
+    path = source.with_suffix(".vtkhdf")
+    with h5py.File(path, "w") as file, h5py.File(source, "r") as original:
+        points = _image(file, recording)
+        for name in (*VECTORS, *SCALARS):
+            node = original.get(f"/{name}")
+            if node is not None:
+                _virtual(points, name, node, recording, source.name)
+        _steps(file["VTKHDF"], recording.time, list(points))
+    return [path, *_wall(path, recording)]
+
+
+class PolySeries:
+    """A temporal file of polygonal data (walls, particles) that grows by one time after the other."""
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        self._file = h5py.File(self.path, "w")
+        root = self._file.create_group("VTKHDF")
+        root.attrs["Version"] = np.array([2, 0], np.int64)
+        root.attrs.create("Type", np.bytes_("PolyData"))
+        self._root, self._steps = root, root.create_group("Steps")
+        self._count = self._points = 0
+        self._topology: tuple[str, np.ndarray] | None = None
+
+    def __enter__(self) -> PolySeries:
+        return self
+
+    def __exit__(self, kind: type | None, fault: BaseException | None, trace: TracebackType | None) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Finish the file."""
+        self._steps.attrs["NSteps"] = np.int64(self._count)
+        self._file.close()
+
+    def append(
+        self,
+        time: float,
+        points: np.ndarray,
+        cells: np.ndarray | None = None,
+        *,
+        point_data: Mapping[str, np.ndarray] | None = None,
+        cell_data: Mapping[str, np.ndarray] | None = None,
+    ) -> None:
+        """Add the state at a time.
+
+        Args:
+            time: s.
+            points: (n, D), m.
+            cells: (m, 3) triangles or (m, 2) lines of point numbers; None makes a vertex of every point.
+            point_data: by name, (n, ...); the same names at every time.
+            cell_data: by name, (m, ...); likewise.
+        """
+        place = np.zeros((len(points), 3))
+        place[:, : points.shape[1]] = points
+        cells = np.arange(len(points))[:, None] if cells is None else np.asarray(cells)
+        kind = {1: "Vertices", 2: "Lines", 3: "Polygons"}[cells.shape[1]]
+        starts = {name: self._length(f"{name}/Connectivity") for name in TOPOLOGIES}
+        cell_starts = {name: self._length(f"{name}/Offsets") - self._count for name in TOPOLOGIES}
+        _grow(self._steps, "Values", np.array([time]))
+        _grow(self._steps, "PartOffsets", np.array([self._count], np.int64))
+        _grow(self._steps, "NumberOfParts", np.array([1], np.int64))
+        _grow(self._steps, "PointOffsets", np.array([self._points], np.int64))
+        _grow(self._steps, "CellOffsets", np.array([[cell_starts[name] for name in TOPOLOGIES]], np.int64))
+        _grow(self._steps, "ConnectivityIdOffsets", np.array([[starts[name] for name in TOPOLOGIES]], np.int64))
+        _grow(self._root, "NumberOfPoints", np.array([len(points)], np.int64))
+        _grow(self._root, "Points", place)
+        for name in TOPOLOGIES:
+            chosen = cells if name == kind else cells[:0]
+            _grow(self._root, f"{name}/NumberOfCells", np.array([len(chosen)], np.int64))
+            _grow(self._root, f"{name}/NumberOfConnectivityIds", np.array([chosen.size], np.int64))
+            _grow(self._root, f"{name}/Offsets", cells.shape[1] * np.arange(len(chosen) + 1, dtype=np.int64))
+            _grow(self._root, f"{name}/Connectivity", chosen.ravel().astype(np.int64))
+        for group, data in (("PointData", point_data), ("CellData", cell_data)):
+            for name, values in (data or {}).items():
+                values = _three(np.asarray(values))
+                _grow(self._steps, f"{group}Offsets/{name}", np.array([self._length(f"{group}/{name}")], np.int64))
+                _grow(self._root, f"{group}/{name}", values)
+        self._count += 1
+        self._points += len(points)
+
+    def _length(self, name: str) -> int:
+        return len(self._root[name]) if name in self._root else 0
+
+
+def _three(values: np.ndarray) -> np.ndarray:
+    """Vectors of a plane with a third component of 0."""
+    if values.ndim == 2 and values.shape[1] == 2:
+        return np.concatenate([values, np.zeros_like(values[:, :1])], axis=1)
+    return values
+
+
+def _grow(group: h5py.Group, name: str, values: np.ndarray) -> None:
+    if name not in group:
+        chunk = (max(1, min(len(values) or 1, 65536)), *values.shape[1:])
+        group.create_dataset(name, data=values, maxshape=(None, *values.shape[1:]), chunks=chunk)
+        return
+    node = group[name]
+    node.resize(len(node) + len(values), axis=0)
+    if len(values):
+        node[-len(values) :] = values
+
+
+def _image(file: h5py.File, recording: Recording) -> h5py.Group:
+    origin, spacing, counts = lattice(recording)
+    root = file.create_group("VTKHDF")
+    root.attrs["Version"] = np.array([2, 0], np.int64)
+    root.attrs.create("Type", np.bytes_("ImageData"))
+    root.attrs["WholeExtent"] = np.array([edge for count in counts for edge in (0, count - 1)], np.int64)
+    root.attrs["Origin"], root.attrs["Spacing"] = origin, spacing
+    root.attrs["Direction"] = np.eye(3).ravel()
+    return root.create_group("PointData")
+
+
+def _steps(root: h5py.Group, time: np.ndarray, names: list[str]) -> None:
+    steps = root.create_group("Steps")
+    steps.attrs["NSteps"] = np.int64(len(time))
+    steps["Values"] = np.asarray(time, np.float64)
+    offsets = steps.create_group("PointDataOffsets")
+    for name in names:
+        offsets[name] = np.arange(len(time), dtype=np.int64)
+
+
+def _store(points: h5py.Group, name: str, values: np.ndarray, dimension: int) -> None:
+    """One chunk a frame, compressed; VTK wants a plane's arrays without the axis of its single layer."""
+    values = values[:, 0] if dimension == 2 else values
+    points.create_dataset(name, data=values, chunks=(1, *values.shape[1:]), compression="gzip", shuffle=True)
+
+
+def _virtual(points: h5py.Group, name: str, node: h5py.Dataset, recording: Recording, file: str) -> None:
+    """A view of a dataset of the recording in the order that VTK wants: components last."""
+    shape, is_vector = (recording.frames, *recording.grid.shape), name in VECTORS
+    source = h5py.VirtualSource(file, f"/{name}", shape=node.shape, dtype=node.dtype)
+    still = node.ndim == recording.dimension + is_vector
+    layout = h5py.VirtualLayout((*shape, 3) if is_vector else shape, node.dtype)
+    for frame in range(recording.frames) if still else [slice(None)]:
+        if not is_vector:
+            layout[frame] = source if still else source[...]
+            continue
+        for component in range(recording.dimension):
+            layout[(frame, ..., component)] = source[component] if still else source[:, component]
+    points.create_virtual_dataset(name, layout, fillvalue=0)
+
+
+def _wall(path: Path, recording: Recording) -> list[Path]:
+    if recording.wall is None:
+        return []
+    wall, beside = recording.wall, path.with_name(f"{path.stem}_wall.vtkhdf")
+    velocity = wall_velocity(wall, recording.time)
+    with PolySeries(beside) as series:
+        for frame, time in enumerate(recording.time.tolist()):
+            surface = wall.at(frame)
+            series.append(
+                time,
+                surface.vertices,
+                wall.faces,
+                point_data={"velocity": velocity[frame]},
+                cell_data={"region": wall.region},
+            )
+    return [beside]

@@ -1,0 +1,1 @@
+"""One file per format of surfaces; each gives the polygons that the file holds, none of which is lost."""

@@ -1,0 +1,42 @@
+"""`torchsph quantify`: what it writes and prints, and what it refuses."""
+
+from __future__ import annotations
+
+import csv
+import json
+
+import numpy as np
+
+import geometry
+from torchsph.cli.main import main
+
+
+def plug(points, time):
+    return np.tile([0.0, 0.0, -(0.5 + 20 * time)], (len(points), 1))
+
+
+def test_table_json_and_csv(tmp_path, capsys, box_recording):
+    truth = box_recording(plug)
+    half = truth.with_velocity(0.5 * truth.velocity, sigma=np.full_like(truth.velocity, 0.1))
+    geometry.write_recording(tmp_path / "truth.h5", truth)
+    geometry.write_recording(tmp_path / "half.h5", half)
+    command = ["quantify", str(tmp_path / "half.h5"), "--truth", str(tmp_path / "truth.h5"), "--out", str(tmp_path)]
+    assert main(command) == 0
+    document = json.loads((tmp_path / "quantities.json").read_text(encoding="utf-8"))
+    found = document["curves"]["analysis"]["kinetic_energy"]
+    speed = 0.5 * (0.5 + 20 * truth.time)
+    np.testing.assert_allclose(found, 0.5 * 1060 * (speed**2 + 0.03) * 1e-6, rtol=1e-4)
+    assert document["beat"]["truth"]["a_time"] is None
+    with (tmp_path / "quantities.csv").open(encoding="utf-8") as file:
+        rows = list(csv.reader(file))
+    assert len(rows) == 4 and "truth pressure_difference [Pa]" in rows[0]
+    table = capsys.readouterr().out
+    assert "flow_inlet (RMS)" in table and "0.500" in table and "wall shear stress" in table
+
+
+def test_faults_are_one_line(tmp_path, capsys, box_recording):
+    plane = box_recording(lambda points, time: 0 * points, dimension=2)
+    geometry.write_recording(tmp_path / "plane.h5", plane)
+    assert main(["quantify", str(tmp_path / "plane.h5"), "--out", str(tmp_path)]) == 2
+    assert "in space" in capsys.readouterr().err
+    assert not (tmp_path / "quantities.json").exists()

@@ -1,0 +1,91 @@
+"""What people read out of a flow: vorticity, energy, forces, flow rates, vortices, pressure, transit of blood.
+
+Pure functions of arrays (velocity, mask, spacing, walls) in SI units; formulas and sources stand above each and in
+`README.md` here.
+"""
+
+from .beat import BEAT_UNITS, beat_numbers
+from .circulation import PlaneCirculation, contour_circulation, plane_circulation
+from .energy import dissipation, energy_loss, integral, kinetic_energy, kinetic_energy_density
+from .fields.acceleration import material_acceleration, pressure_gradient, time_derivative
+from .fields.derivatives import Derivatives, WallSamples
+from .fields.sampling import PlaneSection, plane_section, sample_in_mask
+from .flow_rate import (
+    FillingPeaks,
+    OpeningFlow,
+    e_and_a,
+    plane_flow,
+    regurgitant_fraction,
+    regurgitant_volume,
+    stroke_volume,
+)
+from .force import axial_components, haemodynamic_force
+from .lagrangian.flow_components import FlowComponents, flow_components
+from .lagrangian.moving_flow import MovingFlow, MovingWalls
+from .lagrangian.tracers import Tracers, carry, residence_time, seed_blood
+from .pressure import PressureSolver, pressure_difference, region_mean
+from .quantities import UNITS, FlowDomain, flow_quantities, long_axis
+from .uncertainty import RunningMoments, Summary, around, coverage, summary
+from .vortices import PlaneVortex, VortexRing, main_vortex, vortex_cores, vortex_ring
+from .vorticity import helicity_density, lambda2, q_criterion, vorticity
+from .wall_shear import WallShear
+
+__all__ = [
+    "BEAT_UNITS",
+    "UNITS",
+    "Derivatives",
+    "FillingPeaks",
+    "FlowComponents",
+    "FlowDomain",
+    "MovingFlow",
+    "MovingWalls",
+    "OpeningFlow",
+    "PlaneCirculation",
+    "PlaneSection",
+    "PlaneVortex",
+    "PressureSolver",
+    "RunningMoments",
+    "Summary",
+    "Tracers",
+    "VortexRing",
+    "WallSamples",
+    "WallShear",
+    "around",
+    "axial_components",
+    "beat_numbers",
+    "carry",
+    "contour_circulation",
+    "coverage",
+    "dissipation",
+    "e_and_a",
+    "energy_loss",
+    "flow_components",
+    "flow_quantities",
+    "haemodynamic_force",
+    "helicity_density",
+    "integral",
+    "kinetic_energy",
+    "kinetic_energy_density",
+    "lambda2",
+    "long_axis",
+    "main_vortex",
+    "material_acceleration",
+    "plane_circulation",
+    "plane_flow",
+    "plane_section",
+    "pressure_difference",
+    "pressure_gradient",
+    "q_criterion",
+    "region_mean",
+    "regurgitant_fraction",
+    "regurgitant_volume",
+    "residence_time",
+    "sample_in_mask",
+    "seed_blood",
+    "stroke_volume",
+    "summary",
+    "time_derivative",
+    "vortex_cores",
+    "vortex_ring",
+    "vorticity",
+]

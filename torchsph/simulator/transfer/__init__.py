@@ -1,0 +1,1 @@
+"""Velocities between grids and particles."""
