@@ -28,6 +28,7 @@ def check_recording(recording: Recording, source: str = "recording") -> None:
     """
     for rule in (
         _constants,
+        _description,
         _time,
         _weight,
         _finite,
@@ -57,6 +58,13 @@ def _constants(recording: Recording, source: str) -> None:
         value = getattr(recording, name)
         if not (np.isfinite(value) and value >= 0):
             raise RecordingError(source, f"attribute {name}", f"must be finite and not negative ({unit}), not {value}")
+
+
+def _description(recording: Recording, source: str) -> None:
+    text = recording.description
+    if "\0" in text or any("\ud800" <= letter <= "\udfff" for letter in text):
+        rule = "must be plain text without NUL and without halves of surrogate pairs; leave out what is not text"
+        raise RecordingError(source, "attribute description", rule)
 
 
 def _time(recording: Recording, source: str) -> None:
