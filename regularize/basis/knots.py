@@ -49,6 +49,7 @@ class Knots:
 
     @property
     def axes(self) -> int:
+        """A of the grid: 2 or 3, one more where time is an axis."""
         return len(self.cells)
 
     @property
@@ -58,6 +59,7 @@ class Knots:
 
     @property
     def nodes(self) -> int:
+        """Coefficients of one component in the whole grid."""
         return reduce(lambda a, b: a * b, self.shape, 1)
 
     @property

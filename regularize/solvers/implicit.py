@@ -12,19 +12,39 @@ import torch
 from regularize.rows.operators import System, VectorRows
 
 from .direct import solve_direct
-from .interface import Solved
+from .interface import CholeskyFactor, Solution, Solved
 from .prepared import PreparedSystem
 
 
+class _Context(torch.autograd.function.FunctionCtx):
+    """What the forward pass leaves for the backward pass."""
+
+    saved_tensors: tuple[torch.Tensor, torch.Tensor]
+    block: VectorRows
+    solution: Solution
+    factor: CholeskyFactor
+    prepared: PreparedSystem
+
+
 class _ImplicitSolve(torch.autograd.Function):
+    """The solution as a function of the first block's weights and targets."""
+
     @staticmethod
-    def forward(ctx, weight, target, block, solution, factor, prepared):  # noqa: ANN001, ANN205
+    def forward(
+        ctx: "_Context",
+        weight: torch.Tensor,
+        target: torch.Tensor,
+        block: VectorRows,
+        solution: Solution,
+        factor: CholeskyFactor,
+        prepared: PreparedSystem,
+    ) -> torch.Tensor:
         ctx.save_for_backward(weight, target)
         ctx.block, ctx.solution, ctx.factor, ctx.prepared = block, solution, factor, prepared
         return solution.x.clone()
 
     @staticmethod
-    def backward(ctx, gradient):  # noqa: ANN001, ANN205
+    def backward(ctx: "_Context", gradient: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, None, None, None, None]:
         weight, target = ctx.saved_tensors
         prepared, plain = ctx.prepared, ctx.block.with_unit_weight()
         shape = (prepared.system.knots.nodes, prepared.system.components)

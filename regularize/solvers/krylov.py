@@ -45,13 +45,16 @@ class Krylov:
 
     @property
     def factors(self) -> bool:
+        """Never: only products with the rows are formed."""
         return False
 
     @property
     def starts_from_neighbour(self) -> bool:
+        """Never: the iteration begins at zero."""
         return False
 
     def solve(self, system: System, limits: Limits, neighbour: Neighbour | None = None) -> Solved:
+        """Iterate on the rows, or on the stored matrix; the neighbour is ignored and no factor returned."""
         matvec, rmatvec = sparse_operators(system) if limits.stored else (system.matvec, system.rmatvec)
         solution = self.method(
             matvec,
