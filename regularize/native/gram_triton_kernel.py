@@ -1,5 +1,7 @@
 """The Triton kernel of the assembly; importing this needs triton (see gram_triton.py)."""
 
+# mypy: allow-untyped-defs, allow-incomplete-defs
+# (the language of Triton has no types)
 import triton
 import triton.language as tl
 
