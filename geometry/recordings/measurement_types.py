@@ -88,6 +88,7 @@ class Components:
 
     @property
     def parts(self) -> int:
+        """Number of components at a node."""
         return len(self.directions)
 
     def of(self, vectors: Tensor) -> Tensor:
@@ -135,6 +136,7 @@ class FullVectors(MeasurementType):
 
     @property
     def parts(self) -> int:
+        """Number of components at a node: the dimension."""
         return self.dimension
 
     def directions(self, frame: int) -> np.ndarray:
@@ -142,12 +144,15 @@ class FullVectors(MeasurementType):
         return np.eye(self.dimension).reshape(self.dimension, self.dimension, *[1] * self.dimension)
 
     def components(self, velocity: np.ndarray) -> np.ndarray:
+        """What is seen of vectors: all of them."""
         return velocity
 
     def projected(self, velocity: np.ndarray) -> np.ndarray:
+        """Vectors as they would be measured: unchanged."""
         return velocity
 
     def at(self, frame: int, node: Tensor) -> Components:
+        """Components of a frame at some nodes: the vectors themselves."""
         axes = torch.eye(self.dimension, dtype=torch.float64)
         return Components(axes[:, None].expand(-1, len(node), -1), True)
 
@@ -168,6 +173,7 @@ class AlongBeam(MeasurementType):
 
     @classmethod
     def of(cls, recording: Recording) -> AlongBeam | None:
+        """The type of a recording that holds one component along a beam."""
         return None if recording.beam is None else cls(recording.beam, recording.dimension)
 
     @property

@@ -62,9 +62,11 @@ class PlannedBackend(Backend[Planned]):
         return True
 
     def rates(self, pairs: Planned, state: PairState, support: Support, terms: RateTerms) -> Rates:
+        """See ``Backend.rates``."""
         return Rates(**self._sums(pairs, state, support, plan.rate_passes(terms)))
 
     def momentum(self, pairs: Planned, state: PairState, support: Support, terms: MomentumTerms) -> Tensor:
+        """See ``Backend.momentum``."""
         request = plan.force_pass(terms)
         if request is None:
             return torch.zeros_like(state.position)

@@ -32,9 +32,11 @@ class CellRuns:
     """Particles in cell order and, for each, the runs [start, stop) of particles in the cells around it.
 
     Attributes:
-        order: (N,) int64, cell order -> particle. member: (N,) int32 in cell order.
-        start, stop: (R, N) int32 in cell order; R = 3^(D-1) rows of three cells, or 3^D cells where the first
-            axis is periodic.
+        order: (N,) int64, cell order -> particle.
+        member: (N,) int32, in cell order.
+        start: (R, N) int32, in cell order; R = 3^(D-1) rows of three cells, or 3^D cells where the first axis is
+            periodic.
+        stop: (R, N) int32, likewise.
         period: (D,) floats, inf where an axis is not periodic.
         members: how many members there are.
     """
