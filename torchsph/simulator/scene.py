@@ -229,7 +229,7 @@ class Scene:
                 opening = float(opening) if math.isfinite(opening) else span[0]
                 closing = float(closing) if math.isfinite(closing) else span[1]
             rows.append((float(opening), float(closing)))
-        present = {int(region) for region in recording.wall.region}
+        present = set() if recording.wall is None else {int(region) for region in recording.wall.region}
         valves = tuple(
             Valve(r, tuple(sorted(rows)), recording.period, span) for r, rows in sorted(regions.items()) if r in present
         )

@@ -51,8 +51,8 @@ class WeaklyCompressible(Scheme):
             is not shifted, or None: all are.
         tensile: R of Monaghan's tensile correction (2000; 0.2 there, symmetric pressure form only), or None.
         order: "thesis" steps as Grønli 2017, algorithm 1; "symplectic" evaluates both passes at one position
-            (symplectic Euler); "verlet" is the position Verlet scheme, "predictor_corrector" the symplectic predictor-corrector,
-            both of second order (``stepping.time_schemes``).
+            (symplectic Euler); "verlet" is the position Verlet scheme, "predictor_corrector" the symplectic
+            predictor-corrector, both of second order (``stepping.time_schemes``).
         courant: fraction of the acoustic limit h / (c + v), of h^2/(8 nu) and of sqrt(h / |a|) / 2.
         constant_volume: the fluid fills a volume that never changes (a periodic box, or walls without openings that
             enclose the same volume all the time): its mean density is held, which wanders by percents otherwise.
