@@ -31,8 +31,13 @@ class Stencil(NamedTuple):
 class Grid:
     """Nodes at `origin + spacing * (i, j, k)`.
 
-    `origin` and `spacing` are metres in the order x, y, z; `shape` is in array order (nz, ny, nx). Raises
-    ValueError where they disagree in length, a spacing is not positive or an axis has no node.
+    Args:
+        origin: (D,), m, x first.
+        spacing: (D,), m, x first.
+        shape: nodes in array order, (nz, ny, nx).
+
+    Raises:
+        ValueError: lengths that disagree, a spacing that is not positive, an axis without a node.
     """
 
     origin: tuple[float, ...]
@@ -137,9 +142,14 @@ class Grid:
     def sample(self, field: Tensor, points: Tensor | Stencil, *, outside: str = "clamp") -> Tensor:
         """Multilinear interpolation of `field (*lead, *shape)` at points: `(*lead, n)`.
 
-        `points` is `(n, D)` in metres, shared by all leading axes, or `(*batch, n, D)` where `batch` are the
-        first leading axes of the field; or the `Stencil` of such points. Raises ValueError where the shapes
-        do not fit.
+        Args:
+            field: (*lead, *shape).
+            points: (n, D), m, shared by all leading axes, or (*batch, n, D) where batch are the first leading axes of
+                the field; or the `Stencil` of such points.
+            outside: as in `stencil`.
+
+        Raises:
+            ValueError: shapes that do not fit.
         """
         lead = self._lead(field)
         stencil = points if isinstance(points, Stencil) else self.stencil(points, outside=outside)

@@ -34,10 +34,13 @@ SOFT_LINKS = 16  # a chain longer than this is a circle
 def read_recording(path: str | Path) -> Recording:
     """Read and validate a recording file.
 
-    Raises FileNotFoundError where there is no file, and RecordingError, which names the file, the dataset,
-    the rule and what to do, where it is not a recording or breaks one of the rules. External links, external
-    storage and virtual datasets are refused. The velocity comes back as 0 outside the mask, and may be NaN
-    where the weight is 0.
+    External links, external storage and virtual datasets are refused. The velocity comes back as 0 outside the mask,
+    and may be NaN where the weight is 0.
+
+    Raises:
+        FileNotFoundError: there is no file.
+        RecordingError: it is not a recording or breaks one of the rules; the text names the file, the dataset, the
+            rule and what to do.
     """
     path = Path(path)
     if not path.is_file():

@@ -6,6 +6,8 @@ sizes that must agree are invariants of the class (`Recording`), which refuses t
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 
 from geometry.surfaces.surface import SurfaceError
@@ -187,5 +189,5 @@ def _first(bad: np.ndarray) -> str:
     return f"frame {frame}, node {tuple(node)} (array order)"
 
 
-def _box(lower, upper) -> str:
+def _box(lower: Iterable[float], upper: Iterable[float]) -> str:
     return " x ".join(f"[{a:.4g}, {b:.4g}]" for a, b in zip(lower, upper, strict=True)) + " m"

@@ -18,10 +18,18 @@ def write_recording(path: str | Path, recording: Recording, *, strict: bool = Fa
     """Write a recording file that every reader of the format accepts, replacing a file of that name.
 
     The file is written under another name in the same directory, flushed to the disk and then renamed, so
-    that whoever looks sees the old file or the new one, never a part. Raises RecordingError before anything
-    is written where the recording breaks a rule or cannot be meant (`findings`; with `strict` for whatever is odd about
-    it), FileNotFoundError where the directory does not exist,
-    OSError where the disk is full. The velocity is stored as 0 outside the mask.
+    that whoever looks sees the old file or the new one, never a part. The velocity is stored as 0
+    outside the mask.
+
+    Args:
+        path: of the file.
+        recording: what to write.
+        strict: refuse whatever is odd about it (`findings`), too.
+
+    Raises:
+        RecordingError: it breaks a rule or cannot be meant; nothing is written.
+        FileNotFoundError: the directory does not exist.
+        OSError: the disk is full.
     """
     path = Path(path)
     check_recording(recording, str(path))

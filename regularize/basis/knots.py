@@ -49,6 +49,7 @@ class Knots:
 
     @property
     def axes(self) -> int:
+        """A."""
         return len(self.cells)
 
     @property
@@ -58,6 +59,7 @@ class Knots:
 
     @property
     def nodes(self) -> int:
+        """Number of coefficients of a component."""
         return reduce(lambda a, b: a * b, self.shape, 1)
 
     @property

@@ -15,7 +15,16 @@ import torch
 from regularize.basis.bspline import pieces
 from regularize.errors import InvalidInput
 from regularize.rows.assembly import cell_gram, empty_band
-from regularize.rows.operators import CellRows, DirectionRows, DivergenceRows, RowBlock, System, VectorRows
+from regularize.rows.operators import (
+    CellRows,
+    DirectionRows,
+    DivergenceRows,
+    PointRows,
+    RowBlock,
+    System,
+    VectorRows,
+    at_points,
+)
 from regularize.rows.ordering import Ordering
 
 from . import build, loader
@@ -72,6 +81,14 @@ def available() -> bool:
     return library() is not None
 
 
+def _loaded() -> ctypes.CDLL:
+    """The library, where somebody has asked for compiled code."""
+    lib = library()
+    if lib is None:
+        raise InvalidInput("no compiled library was built with this install: use the engine 'reference'")
+    return lib
+
+
 def _address(tensor: torch.Tensor | None) -> ctypes.c_void_p:
     return ctypes.c_void_p(None if tensor is None else tensor.data_ptr())
 
@@ -82,7 +99,7 @@ def _size(band: torch.Tensor) -> tuple[ctypes.c_void_p, ctypes.c_int64, ctypes.c
 
 def factorise(band: torch.Tensor, reach: torch.Tensor) -> bool:
     """As :func:`regularize.cholesky.factorise`."""
-    lib = library()
+    lib = _loaded()
     lib.spline_set_threads(torch.get_num_threads())
     run = lib.spline_factor_f64 if band.dtype == torch.float64 else lib.spline_factor_f32
     return bool(run(*_size(band), _address(reach)))
@@ -90,7 +107,7 @@ def factorise(band: torch.Tensor, reach: torch.Tensor) -> bool:
 
 def solve(band: torch.Tensor, reach: torch.Tensor, right: torch.Tensor, *, lower: bool, upper: bool) -> torch.Tensor:
     """x (n, k) with L x = right, L' x = right or, with both, L L' x = right for the factor L in the band."""
-    lib, x = library(), right.T.contiguous().clone()
+    lib, x = _loaded(), right.T.contiguous().clone()
     lib.spline_set_threads(torch.get_num_threads())
     run = lib.spline_solve_f64 if band.dtype == torch.float64 else lib.spline_solve_f32
     parts = ctypes.c_int32(lower + 2 * upper)
@@ -105,7 +122,7 @@ class PackedSystem:
     """
 
     def __init__(self, system: System, ordering: Ordering) -> None:
-        self.system, self.ordering, self.lib = system, ordering, library()
+        self.system, self.ordering, self.lib = system, ordering, _loaded()
         self._keep: list[object] = []
         knots, tile = ordering.knots, self.lib.spline_tile_width()
         place = [ordering.axes.index(k) for k in range(system.components)]
@@ -133,7 +150,7 @@ class PackedSystem:
         if any(new is not old and (isinstance(new, CellRows) or new.cell is not old.cell) for new, old in pairs):
             raise InvalidInput("the systems differ in more than the weights and values of rows at the same points")
         other.rows = [
-            rows if new is old else other._reweighed(new, rows, index)
+            rows if new is old else other._reweighed(at_points(new), rows, index)
             for (new, old), rows, index in zip(pairs, self.rows, self.sorted, strict=True)
         ]
         return other
@@ -185,11 +202,12 @@ class PackedSystem:
         self.sorted.append(slot if isinstance(block, CellRows) else index)
         if isinstance(block, CellRows):
             return self._pack_cells(block, start)
-        t = block.t[:, list(self.ordering.axes)][index].double()
-        same = _Rows(kind=KINDS[type(block)], count=len(block), start=self._pointer(start), t=self._pointer(t))
-        return self._reweighed(block, same, index)
+        rows = at_points(block)
+        t = rows.t[:, list(self.ordering.axes)][index].double()
+        same = _Rows(kind=KINDS[type(rows)], count=len(rows), start=self._pointer(start), t=self._pointer(t))
+        return self._reweighed(rows, same, index)
 
-    def _reweighed(self, block: RowBlock, same: _Rows, index: torch.Tensor) -> _Rows:
+    def _reweighed(self, block: PointRows, same: _Rows, index: torch.Tensor) -> _Rows:
         """``same`` rows, sorted by ``index``, with the weights and directions of ``block``."""
         weight = block.weight[index].double()
         shared = False

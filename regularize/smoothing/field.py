@@ -38,6 +38,7 @@ class SplineField:
 
     @property
     def components(self) -> int:
+        """C."""
         return len(self.coefficients)
 
     def supported(self, points: torch.Tensor) -> torch.Tensor:

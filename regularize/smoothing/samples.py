@@ -77,6 +77,7 @@ class FitData:
 
     @property
     def components(self) -> int:
+        """D, of the velocity."""
         return self.velocity.shape[1]
 
     @property

@@ -21,13 +21,16 @@ class Direct:
 
     @property
     def factors(self) -> bool:
+        """In float64 alone."""
         return not self.single
 
     @property
     def starts_from_neighbour(self) -> bool:
+        """Never."""
         return False
 
     def solve(self, system: System, limits: Limits, neighbour: Neighbour | None = None) -> Solved:
+        """As :func:`solve_direct`."""
         return solve_direct(system, tolerance=limits.tolerance, single=self.single, strict=limits.strict)
 
 

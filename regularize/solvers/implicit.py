@@ -6,25 +6,34 @@ b = w t, dL/db = w (s.z) and dL/dw = b (s.z) - 2 w (s.x)(s.z) at fixed b. No ite
 """
 
 from dataclasses import replace
+from typing import Any
 
 import torch
 
 from regularize.rows.operators import System, VectorRows
 
 from .direct import solve_direct
-from .interface import Solved
+from .interface import CholeskyFactor, Solution, Solved
 from .prepared import PreparedSystem
 
 
 class _ImplicitSolve(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, weight, target, block, solution, factor, prepared):  # noqa: ANN001, ANN205
+    def forward(
+        ctx: Any,
+        weight: torch.Tensor,
+        target: torch.Tensor,
+        block: VectorRows,
+        solution: Solution,
+        factor: CholeskyFactor,
+        prepared: PreparedSystem,
+    ) -> torch.Tensor:
         ctx.save_for_backward(weight, target)
         ctx.block, ctx.solution, ctx.factor, ctx.prepared = block, solution, factor, prepared
         return solution.x.clone()
 
     @staticmethod
-    def backward(ctx, gradient):  # noqa: ANN001, ANN205
+    def backward(ctx: Any, gradient: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         weight, target = ctx.saved_tensors
         prepared, plain = ctx.prepared, ctx.block.with_unit_weight()
         shape = (prepared.system.knots.nodes, prepared.system.components)

@@ -45,13 +45,16 @@ class Krylov:
 
     @property
     def factors(self) -> bool:
+        """None."""
         return False
 
     @property
     def starts_from_neighbour(self) -> bool:
+        """Never."""
         return False
 
     def solve(self, system: System, limits: Limits, neighbour: Neighbour | None = None) -> Solved:
+        """By the method, on applied or stored rows."""
         matvec, rmatvec = sparse_operators(system) if limits.stored else (system.matvec, system.rmatvec)
         solution = self.method(
             matvec,

@@ -22,13 +22,16 @@ class NeighbourGradients:
 
     @property
     def factors(self) -> bool:
+        """Where there is no neighbour."""
         return True
 
     @property
     def starts_from_neighbour(self) -> bool:
+        """Where there is one."""
         return True
 
     def solve(self, system: System, limits: Limits, neighbour: Neighbour | None = None) -> Solved:
+        """As :func:`pcg`, at most ITERATIONS of them; else directly."""
         if neighbour is None:
             return solve_direct(system, tolerance=limits.tolerance, strict=limits.strict)
         if neighbour.factor is None or neighbour.knots != system.knots:

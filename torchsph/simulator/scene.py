@@ -219,6 +219,7 @@ class Scene:
         the same scene results from a noisy and from a clean recording. Walls that flicker are estimated, and valve
         times that the recording lacks or cannot mean (``geometry.estimated``).
         """
+        recording.wall_for("the simulator")
         recording = geometry.estimated(recording).recording
         intervals = recording.valve_intervals_or_derived()
         regions: dict[int, list[tuple[float, float]]] = {}
@@ -229,7 +230,7 @@ class Scene:
                 opening = float(opening) if math.isfinite(opening) else span[0]
                 closing = float(closing) if math.isfinite(closing) else span[1]
             rows.append((float(opening), float(closing)))
-        present = set() if recording.wall is None else {int(region) for region in recording.wall.region}
+        present = {int(region) for region in recording.wall_for("the simulator").region}
         valves = tuple(
             Valve(r, tuple(sorted(rows)), recording.period, span) for r, rows in sorted(regions.items()) if r in present
         )
