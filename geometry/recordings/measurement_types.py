@@ -178,9 +178,11 @@ class AlongBeam(MeasurementType):
 
     @property
     def parts(self) -> int:
+        """Number of components at a node: one."""
         return 1
 
     def directions(self, frame: int) -> np.ndarray:
+        """(1, D, *shape) unit vectors along the beam."""
         return (self.beam[frame] if self.moving else self.beam)[None]
 
 
