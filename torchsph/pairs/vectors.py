@@ -9,11 +9,20 @@ from torch import Tensor
 
 
 @overload
-def per_particle(value: Tensor, member: Tensor) -> Tensor: ...
+def per_particle(value: Tensor, member: Tensor) -> Tensor:
+    """One value for each particle."""
+
+
 @overload
-def per_particle(value: float, member: Tensor) -> float: ...
+def per_particle(value: float, member: Tensor) -> float:
+    """One value for each particle."""
+
+
 @overload
-def per_particle(value: float | Tensor, member: Tensor) -> float | Tensor: ...
+def per_particle(value: float | Tensor, member: Tensor) -> float | Tensor:
+    """One value for each particle."""
+
+
 def per_particle(value: float | Tensor, member: Tensor) -> float | Tensor:
     """A coefficient given per member, (members,), spread over the particles (N,); a float stays a float."""
     return value.index_select(0, member) if isinstance(value, Tensor) and value.ndim else value
