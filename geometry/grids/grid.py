@@ -31,8 +31,13 @@ class Stencil(NamedTuple):
 class Grid:
     """Nodes at `origin + spacing * (i, j, k)`.
 
-    `origin` and `spacing` are metres in the order x, y, z; `shape` is in array order (nz, ny, nx). Raises
-    ValueError where they disagree in length, a spacing is not positive or an axis has no node.
+    Args:
+        origin: of node 0, m, in the order x, y, z.
+        spacing: m, in the order x, y, z.
+        shape: nodes in array order (nz, ny, nx).
+
+    Raises:
+        ValueError: they disagree in length, a spacing is not positive or an axis has no node.
     """
 
     origin: tuple[float, ...]
@@ -138,8 +143,10 @@ class Grid:
         """Multilinear interpolation of `field (*lead, *shape)` at points: `(*lead, n)`.
 
         `points` is `(n, D)` in metres, shared by all leading axes, or `(*batch, n, D)` where `batch` are the
-        first leading axes of the field; or the `Stencil` of such points. Raises ValueError where the shapes
-        do not fit.
+        first leading axes of the field; or the `Stencil` of such points.
+
+        Raises:
+            ValueError: the shapes do not fit.
         """
         lead = self._lead(field)
         stencil = points if isinstance(points, Stencil) else self.stencil(points, outside=outside)

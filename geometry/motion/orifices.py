@@ -129,7 +129,8 @@ class Orifice:
 def orifices(motion: WallMotion) -> list[Orifice]:
     """The openings of a moving wall: one for each connected set of faces of a region above 0, by label.
 
-    Raises SurfaceError where a region covers the whole surface and so has no rim.
+    Raises:
+        SurfaceError: a region covers the whole surface and so has no rim.
     """
     found = []
     for label in np.unique(motion.region[motion.region > 0]):

@@ -66,7 +66,11 @@ class WallEstimate:
         """The recording with the estimated wall and its velocity; itself where nothing was found to mend."""
         if self.velocity is None:
             return recording
-        wall = replace(recording.wall, vertices=self.vertices, velocity=self.velocity.astype(np.float32))
+        wall = replace(
+            recording.wall_for("the estimate of its motion"),
+            vertices=self.vertices,
+            velocity=self.velocity.astype(np.float32),
+        )
         return replace(recording, wall=wall)
 
     def words(self) -> str:
@@ -118,7 +122,7 @@ def _assembled(
     series: SmoothedSeries,
 ) -> WallEstimate:
     """The estimate from the modes' shapes (n, nv D), courses (K, n) as given, and these as estimated."""
-    wall, time = recording.wall, np.asarray(recording.time, np.float64)
+    wall, time = recording.wall_for("the estimate of its motion"), np.asarray(recording.time, np.float64)
     vertices = (middle + series.value @ shapes).reshape(given.shape)
     velocity = (series.rate @ shapes).reshape(given.shape)
     motion = WallMotion.through(time, vertices, wall.faces, wall.region, rates=velocity)

@@ -66,7 +66,16 @@ class WallMotion:
         return cls.through(time, vertices, wall.faces, wall.region, rates=rates, period=recording.period)
 
     @classmethod
-    def through(cls, time, vertices, faces, region, *, rates=None, period: float = 0.0) -> WallMotion:
+    def through(
+        cls,
+        time: np.ndarray,
+        vertices: np.ndarray,
+        faces: np.ndarray,
+        region: np.ndarray,
+        *,
+        rates: np.ndarray | None = None,
+        period: float = 0.0,
+    ) -> WallMotion:
         """The motion through key `vertices` (K, nv, D), m, with `rates` (m/s) or differences of them."""
         time, vertices = np.asarray(time, np.float64), np.asarray(vertices, np.float64)
         if rates is None:

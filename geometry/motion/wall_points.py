@@ -35,7 +35,10 @@ class WallSampler:
     the angle-weighted mean over the faces around it whose normals differ by less than this from the face's
     own, so that curves are smooth and the rim of a base stays sharp; 0 gives the normals of the faces. The
     areas add up to the area of the wall; with `smooth_angle=0` and faces larger than the spacing the sum of
-    area * normal . velocity is dV/dt to round-off. Raises ValueError for a spacing or angle out of range.
+    area * normal . velocity is dV/dt to round-off.
+
+    Raises:
+        ValueError: a spacing or angle out of range.
     """
 
     def __init__(self, motion: WallMotion, spacing: float, *, smooth_angle: float = 40.0) -> None:

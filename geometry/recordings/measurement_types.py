@@ -88,6 +88,7 @@ class Components:
 
     @property
     def parts(self) -> int:
+        """Numbers measured at each place."""
         return len(self.directions)
 
     def of(self, vectors: Tensor) -> Tensor:
@@ -135,6 +136,7 @@ class FullVectors(MeasurementType):
 
     @property
     def parts(self) -> int:
+        """D: all components are measured."""
         return self.dimension
 
     def directions(self, frame: int) -> np.ndarray:
@@ -142,12 +144,15 @@ class FullVectors(MeasurementType):
         return np.eye(self.dimension).reshape(self.dimension, self.dimension, *[1] * self.dimension)
 
     def components(self, velocity: np.ndarray) -> np.ndarray:
+        """The velocity itself: nothing of it is missing."""
         return velocity
 
     def projected(self, velocity: np.ndarray) -> np.ndarray:
+        """The velocity itself: nothing of it is lost."""
         return velocity
 
     def at(self, frame: int, node: Tensor) -> Components:
+        """The axes as directions at nodes (q,), flat indices, whatever the frame."""
         axes = torch.eye(self.dimension, dtype=torch.float64)
         return Components(axes[:, None].expand(-1, len(node), -1), True)
 
@@ -168,13 +173,16 @@ class AlongBeam(MeasurementType):
 
     @classmethod
     def of(cls, recording: Recording) -> AlongBeam | None:
+        """Of a recording that gives its beam; None for others."""
         return None if recording.beam is None else cls(recording.beam, recording.dimension)
 
     @property
     def parts(self) -> int:
+        """1: the component along the beam."""
         return 1
 
     def directions(self, frame: int) -> np.ndarray:
+        """(1, D, *shape) unit vectors of the beam at a frame."""
         return (self.beam[frame] if self.moving else self.beam)[None]
 
 

@@ -103,7 +103,7 @@ def wall_motion(recording: Recording) -> Iterator[Finding]:
 
 def _enclosed(recording: Recording) -> np.ndarray:
     """Volume inside the wall at each frame, m^3."""
-    wall = recording.wall
+    wall = recording.wall_for("the enclosed volume")
     first = wall.at(0).volume
     if not wall.moves:
         return np.full(recording.frames, first)

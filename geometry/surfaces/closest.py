@@ -59,7 +59,8 @@ class SurfaceIndex:
     def query(self, points: np.ndarray) -> Closest:
         """The closest surface point of each of `points (n, D)`, m.
 
-        Raises ValueError for points that are not finite or of the wrong shape.
+        Raises:
+            ValueError: points that are not finite or of the wrong shape.
         """
         points = np.ascontiguousarray(points, dtype=np.float64)
         if points.ndim != 2 or points.shape[1] != self.surface.dimension or not np.isfinite(points).all():
@@ -95,7 +96,14 @@ class SurfaceIndex:
             look *= 4
         return state[1], state[2]
 
-    def _improve(self, points, todo, vertex, needed, state) -> None:
+    def _improve(
+        self,
+        points: np.ndarray,
+        todo: np.ndarray,
+        vertex: np.ndarray,
+        needed: np.ndarray,
+        state: tuple[np.ndarray, np.ndarray, np.ndarray],
+    ) -> None:
         """Try the faces around vertices `(len(todo), k)` where needed and keep what is closer, in place."""
         best, face, weights = state
         row, column = np.nonzero(needed)
@@ -141,7 +149,9 @@ class _FaceTable:
         return self._triangle(square, along, across, gram, self.scale[face].T)
 
     @staticmethod
-    def _triangle(square, along, across, gram, scale):
+    def _triangle(
+        square: np.ndarray, along: np.ndarray, across: np.ndarray, gram: np.ndarray, scale: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Minimise |offset - s e0 - t e1|^2: the foot of the normal if inside, else a point of an edge."""
         a, b, c, over_a, over_c = gram
         s = (c * along - b * across) * scale[1]

@@ -23,7 +23,8 @@ def repaired(surface: Surface, *, merge: float | None = None, hole_region: int |
     in the same order. A sequence of labels is given to the holes in order of the lengths of their rims, the
     longest first; the holes that are left are wall, region 0.
 
-    Raises SurfaceError where that is not enough, as where three faces meet at an edge.
+    Raises:
+        SurfaceError: that is not enough, as where three faces meet at an edge.
     """
     lower, upper = surface.bounds
     tolerance = 1e-7 * float(np.linalg.norm(upper - lower)) if merge is None else merge

@@ -31,8 +31,10 @@ def surface_from_points(points: np.ndarray, *, alpha: float) -> Surface:
     """The outer surface of a cloud of points `(n, D)`, m, concave down to `alpha` (m).
 
     The points must fill the body, not only its surface, unless alpha exceeds the body's radius. Of several
-    separate bodies the largest is taken; cavities are filled. Raises SurfaceError for too few points, points
-    in a plane, or an alpha below half the spacing of the points.
+    separate bodies the largest is taken; cavities are filled.
+
+    Raises:
+        SurfaceError: too few points, points in a plane, or an alpha below half the spacing of the points.
     """
     points = np.asarray(points, np.float64)
     if points.ndim != 2 or points.shape[1] not in (2, 3) or not np.isfinite(points).all():
@@ -51,7 +53,10 @@ def surface_from_mask(mask: np.ndarray, grid: Grid, *, alpha: float = np.inf, sm
 
     It runs midway between nodes inside and outside and follows every concavity of the mask: a simplex belongs
     to the body where the mask, interpolated at its middle, is at least a half; `alpha` (m) may limit it
-    further. `smoothing` passes of Taubin's filter take the steps out. Raises SurfaceError for an empty mask.
+    further. `smoothing` passes of Taubin's filter take the steps out.
+
+    Raises:
+        SurfaceError: an empty mask.
     """
     mask = np.asarray(mask).astype(bool)
     if mask.shape != grid.shape:

@@ -28,10 +28,12 @@ class SurfaceError(ValueError):
 class Surface:
     """Vertices `(nv, D)`, m, faces `(nf, D)` of vertex numbers, and a region label `(nf,)` for each face.
 
-    Region 0 is wall, 1 the mitral inlet, 2 the aortic outlet; further labels are free. D is 2 or 3. Raises
-    SurfaceError for shapes that do not fit, vertices that are not finite and face indices out of range.
+    Region 0 is wall, 1 the mitral inlet, 2 the aortic outlet; further labels are free. D is 2 or 3.
     Closedness and orientation are not required to build one: `check` does that, `repaired` (see `repair`)
     mends.
+
+    Raises:
+        SurfaceError: shapes that do not fit, vertices that are not finite, face indices out of range.
     """
 
     vertices: np.ndarray

@@ -69,7 +69,9 @@ def grid_winding(grid: Grid, vertices: np.ndarray, faces: np.ndarray) -> np.ndar
     return np.cumsum(jumps[::-1], axis=0, dtype=np.int32)[::-1]
 
 
-def _segment_crossings(place, height, faces, counts):
+def _segment_crossings(
+    place: np.ndarray, height: np.ndarray, faces: np.ndarray, counts: tuple[int, ...]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Grid lines crossed by each segment: line number, height, sign (+1 where the line leaves the inside)."""
     start, end = place[faces[:, 0], 0], place[faces[:, 1], 0]
     first = np.maximum(np.ceil(np.minimum(start, end)), 0).astype(np.int64)
@@ -81,7 +83,9 @@ def _segment_crossings(place, height, faces, counts):
     return line, h0 + fraction * (h1 - h0), np.sign(start - end)[segment]
 
 
-def _triangle_crossings(place, height, faces, counts):
+def _triangle_crossings(
+    place: np.ndarray, height: np.ndarray, faces: np.ndarray, counts: tuple[int, ...]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Grid lines that pierce each triangle: flat line number, height, sign (+1 leaving the inside)."""
     corner = place[faces]
     lower = np.maximum(np.ceil(corner.min(1)), 0).astype(np.int64)
@@ -99,7 +103,7 @@ def _triangle_crossings(place, height, faces, counts):
     return (i + counts[0] * j)[pierced], z, np.sign(area)
 
 
-def _edge(place, a, b, at):
+def _edge(place: np.ndarray, a: np.ndarray, b: np.ndarray, at: np.ndarray) -> np.ndarray:
     """Twice the signed area of (a, b, at), evaluated with the smaller vertex first.
 
     The two triangles that share an edge then get the same number with opposite sign, bit for bit, so that a

@@ -74,7 +74,10 @@ class Ventricle:
 
     `length` from base to apex; `semi_major`, `semi_minor` of the spheroid along z and across;
     `mitral_centre`, `mitral_semi_axes` (along x, y) and `aortic_centre`, `aortic_radius` in the base plane;
-    `axial_share` is the k of the module's formula. Raises ValueError where orifices leave the base or meet.
+    `axial_share` is the k of the module's formula.
+
+    Raises:
+        ValueError: orifices leave the base or meet.
     """
 
     length: float = 0.030
