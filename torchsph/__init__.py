@@ -10,7 +10,7 @@ from .methods.ensemble.options import EnsembleOptions, Estimated
 from .methods.forecast_skill import ForecastSkill, skill
 from .methods.measurement.error_model import ObservationError, estimate_error
 from .methods.measurement.frame_splines import smooth
-from .methods.measurement.prepared import PreparedMeasurement
+from .methods.measurement.prepared import PreparedMeasurement as PreparedMeasurement
 from .methods.nudging import FilteredRun, filter_sph
 from .pairs.smoothing_kernels import KERNELS, SmoothingKernel, kernel
 from .simulator.failures import NumericalFailure
@@ -50,7 +50,6 @@ __all__ = [
     "ObservationError",
     "PopulationControl",
     "PotentialWall",
-    "PreparedMeasurement",
     "PressureSource",
     "Projection",
     "Reservoir",

@@ -32,12 +32,12 @@ class Grid:
     """Nodes at `origin + spacing * (i, j, k)`.
 
     Args:
-        origin: of node 0, m, in the order x, y, z.
-        spacing: m, in the order x, y, z.
-        shape: nodes in array order (nz, ny, nx).
+        origin: (D,), m, x first.
+        spacing: (D,), m, x first.
+        shape: nodes in array order, (nz, ny, nx).
 
     Raises:
-        ValueError: they disagree in length, a spacing is not positive or an axis has no node.
+        ValueError: lengths that disagree, a spacing that is not positive, an axis without a node.
     """
 
     origin: tuple[float, ...]
@@ -142,11 +142,14 @@ class Grid:
     def sample(self, field: Tensor, points: Tensor | Stencil, *, outside: str = "clamp") -> Tensor:
         """Multilinear interpolation of `field (*lead, *shape)` at points: `(*lead, n)`.
 
-        `points` is `(n, D)` in metres, shared by all leading axes, or `(*batch, n, D)` where `batch` are the
-        first leading axes of the field; or the `Stencil` of such points.
+        Args:
+            field: (*lead, *shape).
+            points: (n, D), m, shared by all leading axes, or (*batch, n, D) where batch are the first leading axes of
+                the field; or the `Stencil` of such points.
+            outside: as in `stencil`.
 
         Raises:
-            ValueError: the shapes do not fit.
+            ValueError: shapes that do not fit.
         """
         lead = self._lead(field)
         stencil = points if isinstance(points, Stencil) else self.stencil(points, outside=outside)

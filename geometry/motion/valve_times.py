@@ -74,13 +74,13 @@ def find_valve_times(recording: Recording, estimate: WallEstimate | None = None)
         estimate: its walls' motion, where that has been estimated and applied already.
 
     Raises:
-        ValueError: the recording has no wall.
+        RecordingError: the recording has no wall.
     """
     if estimate is None:
         estimate = estimate_wall(recording)
         recording = estimate.applied(recording)
     given = recording.valve_intervals_or_derived()
-    labels = sorted({int(label) for label in recording.wall_for("the openings' times").region if label > 0})
+    labels = sorted({int(label) for label in recording.wall_for("valve times").region if label > 0})
     if not labels:
         return ValveTimes(given, np.zeros((len(given), 2)), "given")
     motion = WallMotion.from_recording(recording)

@@ -67,9 +67,7 @@ class WallEstimate:
         if self.velocity is None:
             return recording
         wall = replace(
-            recording.wall_for("the estimate of its motion"),
-            vertices=self.vertices,
-            velocity=self.velocity.astype(np.float32),
+            recording.wall_for("an estimated wall"), vertices=self.vertices, velocity=self.velocity.astype(np.float32)
         )
         return replace(recording, wall=wall)
 
@@ -89,11 +87,9 @@ def estimate_wall(recording: Recording) -> WallEstimate:
     where the wall stands still, or where there are too few frames to tell, the given wall is returned as it is.
 
     Raises:
-        ValueError: the recording has no wall.
+        RecordingError: the recording has no wall.
     """
-    wall = recording.wall
-    if wall is None:
-        raise ValueError("estimate_wall needs a wall (/wall): this recording has none")
+    wall = recording.wall_for("estimate_wall")
     time = np.asarray(recording.time, np.float64)
     # the last frame may come close to the repetition of the first: the spline takes any distance but nought
     repeats = recording.period if recording.period and time[-1] - time[0] < recording.period * (1 - 1e-6) else 0.0
@@ -122,7 +118,7 @@ def _assembled(
     series: SmoothedSeries,
 ) -> WallEstimate:
     """The estimate from the modes' shapes (n, nv D), courses (K, n) as given, and these as estimated."""
-    wall, time = recording.wall_for("the estimate of its motion"), np.asarray(recording.time, np.float64)
+    wall, time = recording.wall_for("an estimated wall"), np.asarray(recording.time, np.float64)
     vertices = (middle + series.value @ shapes).reshape(given.shape)
     velocity = (series.rate @ shapes).reshape(given.shape)
     motion = WallMotion.through(time, vertices, wall.faces, wall.region, rates=velocity)

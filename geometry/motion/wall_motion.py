@@ -76,7 +76,16 @@ class WallMotion:
         rates: np.ndarray | None = None,
         period: float = 0.0,
     ) -> WallMotion:
-        """The motion through key `vertices` (K, nv, D), m, with `rates` (m/s) or differences of them."""
+        """The motion through key frames.
+
+        Args:
+            time: (K,), s, increasing.
+            vertices: (K, nv, D), m.
+            faces: (nf, D), vertex numbers.
+            region: (nf,), labels.
+            rates: (K, nv, D), m/s; None: three-point differences of the vertices.
+            period: s, 0 = none.
+        """
         time, vertices = np.asarray(time, np.float64), np.asarray(vertices, np.float64)
         if rates is None:
             rates = _differences(time, vertices, period)

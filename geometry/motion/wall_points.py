@@ -31,11 +31,15 @@ class WallPoints(NamedTuple):
 class WallSampler:
     """Points about `spacing` (m) apart on a moving wall.
 
-    `smooth_angle` (degrees): normals are interpolated between the corners of a face, and a corner's normal is
-    the angle-weighted mean over the faces around it whose normals differ by less than this from the face's
-    own, so that curves are smooth and the rim of a base stays sharp; 0 gives the normals of the faces. The
-    areas add up to the area of the wall; with `smooth_angle=0` and faces larger than the spacing the sum of
+    The areas add up to the area of the wall; with `smooth_angle=0` and faces larger than the spacing the sum of
     area * normal . velocity is dV/dt to round-off.
+
+    Args:
+        motion: of the wall.
+        spacing: m, between points.
+        smooth_angle: degrees. Normals are interpolated between the corners of a face, and a corner's normal is the
+            angle-weighted mean over the faces around it whose normals differ by less than this from the face's own, so
+            that curves are smooth and the rim of a base stays sharp; 0 gives the normals of the faces.
 
     Raises:
         ValueError: a spacing or angle out of range.

@@ -6,6 +6,8 @@ sizes that must agree are invariants of the class (`Recording`), which refuses t
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 
 from geometry.surfaces.surface import SurfaceError
@@ -14,6 +16,17 @@ from .errors import RecordingError
 from .recording import RULES, Recording
 
 FASTEST = 20.0  # m/s; blood never is as fast, so larger numbers are mm/s or cm/s
+
+# Far beyond every flow that somebody measures; numbers outside would run out of memory, time or floating-point range.
+LONGEST = 1e3  # m
+FINEST = 1e-9  # m
+LATEST = 1e10  # s; seconds since 1970 are below
+SHORTEST_PERIOD = 1e-3  # s
+MOST_PERIODS = 10_000
+MOST_INTERVALS = 1_000  # a valve opens about once a beat
+DENSITIES = (1e-3, 1e6)  # kg/m^3
+STICKIEST = 1e6  # Pa s
+STRAY = 10.0  # sizes of the surface at most, by which vertices that no face uses may widen its box
 
 
 def check_recording(recording: Recording, source: str = "recording") -> None:
@@ -28,6 +41,8 @@ def check_recording(recording: Recording, source: str = "recording") -> None:
     """
     for rule in (
         _constants,
+        _description,
+        _grid,
         _time,
         _weight,
         _finite,
@@ -51,23 +66,52 @@ def measured_nodes(recording: Recording) -> np.ndarray:
 
 
 def _constants(recording: Recording, source: str) -> None:
-    if not (np.isfinite(recording.rho) and recording.rho > 0):
-        raise RecordingError(source, "attribute rho", f"must be a positive density in kg/m^3, not {recording.rho}")
-    for name, unit in (("mu", "Pa s"), ("period", "s; 0 = not periodic")):
+    low, high = DENSITIES
+    if not low <= recording.rho <= high:
+        rule = f"must be a positive density in kg/m^3, from {low:g} to {high:g}, not {recording.rho}"
+        raise RecordingError(source, "attribute rho", rule)
+    for name, most, unit in (("mu", STICKIEST, "Pa s"), ("period", LATEST, "s; 0 = not periodic")):
         value = getattr(recording, name)
-        if not (np.isfinite(value) and value >= 0):
-            raise RecordingError(source, f"attribute {name}", f"must be finite and not negative ({unit}), not {value}")
+        if not 0 <= value <= most:
+            rule = f"must be finite and not negative ({unit}), at most {most:g}, not {value}"
+            raise RecordingError(source, f"attribute {name}", rule)
+    if 0 < recording.period < SHORTEST_PERIOD:
+        rule = f"is {recording.period:g} s, shorter than every beat; give it in seconds, or 0 where nothing repeats"
+        raise RecordingError(source, "attribute period", rule)
+
+
+def _description(recording: Recording, source: str) -> None:
+    text = recording.description
+    if "\0" in text or any("\ud800" <= letter <= "\udfff" for letter in text):
+        rule = "must be plain text without NUL and without halves of surrogate pairs; leave out what is not text"
+        raise RecordingError(source, "attribute description", rule)
+
+
+def _grid(recording: Recording, source: str) -> None:
+    grid = recording.grid
+    if min(grid.spacing) < FINEST or max(grid.spacing) > LONGEST:
+        rule = f"spacing must lie between {FINEST:g} and {LONGEST:g} m, not {grid.spacing}; give it in metres"
+        raise RecordingError(source, "/grid", rule)
+    if max(abs(end) for end in (*grid.origin, *grid.upper)) > LONGEST:
+        rule = f"the box {_box(grid.origin, grid.upper)} lies farther than {LONGEST:g} m from 0; give it in metres"
+        raise RecordingError(source, "/grid", rule)
 
 
 def _time(recording: Recording, source: str) -> None:
     time = recording.time
     if not np.isfinite(time).all():
         raise RecordingError(source, "/time", "must be finite, in seconds")
+    if np.abs(time).max() > LATEST:
+        rule = f"reaches {np.abs(time).max():g} s, farther than {LATEST:g} s from 0; give seconds"
+        raise RecordingError(source, "/time", rule)
     falling = np.diff(time) <= 0
     if falling.any():
         frame = int(np.argmax(falling))
         rule = f"must increase strictly, but frame {frame} at {time[frame]:g} s precedes {time[frame + 1]:g} s"
         raise RecordingError(source, "/time", f"{rule}; sort the frames and drop repeated ones")
+    if time[-1] - time[0] > MOST_PERIODS * recording.period > 0:
+        rule = f"is {recording.period:g} s, of which the frames span more than {MOST_PERIODS}; give both in seconds"
+        raise RecordingError(source, "attribute period", rule)
 
 
 def _weight(recording: Recording, source: str) -> None:
@@ -130,6 +174,9 @@ def _wall(recording: Recording, source: str) -> None:
     for dataset, values in (("/wall/vertices", wall.vertices), ("/wall/velocity", wall.velocity)):
         if values is not None and not np.isfinite(values).all():
             raise RecordingError(source, dataset, "must be finite everywhere")
+    if wall.vertices.size and np.abs(wall.vertices).max() > LONGEST:
+        rule = f"reaches {np.abs(wall.vertices).max():g} m, farther than {LONGEST:g} m from 0; give it in metres"
+        raise RecordingError(source, "/wall/vertices", rule)
     if len(wall.faces) == 0:
         raise RecordingError(source, "/wall/faces", "holds no face, so there is no surface around the blood")
     try:
@@ -137,6 +184,11 @@ def _wall(recording: Recording, source: str) -> None:
         first.check()
     except SurfaceError as fault:
         raise RecordingError(source, "/wall/faces", str(fault)) from fault
+    used = wall.vertices[..., np.unique(wall.faces), :]
+    size, widened = (np.ptp(part, axis=-2).max() for part in (used, wall.vertices))
+    if widened > (1 + STRAY) * size:
+        rule = f"vertices that no face uses lie up to {widened:.3g} m away from a surface of {size:.3g} m; remove them"
+        raise RecordingError(source, "/wall/vertices", rule)
     # Closedness is a matter of the faces alone; only the orientation may change in later frames.
     sense = np.sign(first.component_volumes)
     for frame in range(1, recording.frames if wall.moves else 1):
@@ -160,8 +212,13 @@ def _overlap(recording: Recording, source: str) -> None:
 def _valves(recording: Recording, source: str) -> None:
     intervals = recording.valve_intervals
     if intervals is not None:
+        if len(intervals) > MOST_INTERVALS:
+            rule = f"holds {len(intervals)} rows, more than {MOST_INTERVALS}; a valve opens about once a beat"
+            raise RecordingError(source, "/valve/intervals", f"{rule}: give a row for each time, or one beat's")
         if not np.isfinite(intervals).all():
             raise RecordingError(source, "/valve/intervals", "must be finite: rows (region label, opens, closes)")
+        if np.abs(intervals[:, 1:]).max(initial=0) > LATEST:
+            raise RecordingError(source, "/valve/intervals", f"times must lie within {LATEST:g} s from 0; give seconds")
         label = intervals[:, 0]
         if ((label != np.rint(label)) | (label < 1)).any():
             rule = f"its first column must hold region labels 1, 2, ..., not {label}"
@@ -187,5 +244,5 @@ def _first(bad: np.ndarray) -> str:
     return f"frame {frame}, node {tuple(node)} (array order)"
 
 
-def _box(lower, upper) -> str:
+def _box(lower: Iterable[float], upper: Iterable[float]) -> str:
     return " x ".join(f"[{a:.4g}, {b:.4g}]" for a, b in zip(lower, upper, strict=True)) + " m"

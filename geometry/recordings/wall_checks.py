@@ -103,7 +103,7 @@ def wall_motion(recording: Recording) -> Iterator[Finding]:
 
 def _enclosed(recording: Recording) -> np.ndarray:
     """Volume inside the wall at each frame, m^3."""
-    wall = recording.wall_for("the enclosed volume")
+    wall = recording.wall_for("the volume")
     first = wall.at(0).volume
     if not wall.moves:
         return np.full(recording.frames, first)

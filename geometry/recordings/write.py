@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import tempfile
 from pathlib import Path
 
 import h5py
@@ -12,34 +10,40 @@ import numpy as np
 from .checks import refuse_implausible
 from .recording import Recording
 from .rules import check_recording
+from .whole_file import refuse_special, write_whole
 
 
 def write_recording(path: str | Path, recording: Recording, *, strict: bool = False) -> None:
     """Write a recording file that every reader of the format accepts, replacing a file of that name.
 
-    The file is written under another name in the same directory, flushed to the disk and then renamed, so
-    that whoever looks sees the old file or the new one, never a part. Raises RecordingError before anything
-    is written where the recording breaks a rule or cannot be meant (`findings`; with `strict` for whatever is odd about
-    it), FileNotFoundError where the directory does not exist,
-    OSError where the disk is full. The velocity is stored as 0 outside the mask.
+    The file is made in memory and then written by `write_whole`: HDF5 never meets a disk that is full, and whoever
+    looks sees the old file or the new one, never a part. The velocity is stored as 0 outside the mask.
+
+    Args:
+        path: of the file; its folder exists.
+        recording: what is written.
+        strict: refuse whatever is odd about the recording (`findings`), not only what cannot be meant.
+
+    Raises:
+        RecordingError: before anything is written, the recording breaks a rule or cannot be meant.
+        FileNotFoundError: the folder does not exist.
+        OSError: the disk is full, the folder cannot be written to, or a link, device or folder has the name.
     """
     path = Path(path)
     check_recording(recording, str(path))
     refuse_implausible(recording, str(path), strict=strict)
+    refuse_special(path)
     if not path.parent.is_dir():
         raise FileNotFoundError(f"{path}: there is no directory {path.parent}; make it first")
-    handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".part", dir=path.parent)
-    os.close(handle)
-    try:
-        with h5py.File(name, "w") as file:
-            _fill(file, recording)
-        _flush(name)
-        os.chmod(name, 0o666 & ~_umask())
-        os.replace(name, path)
-    except BaseException:
-        os.unlink(name)
-        raise
-    _flush(str(path.parent))
+    write_whole(path, _image(recording))
+
+
+def _image(recording: Recording) -> bytes:
+    """The bytes of the file, about as many as it takes on the disk."""
+    with h5py.File("recording in memory", "w", driver="core", backing_store=False) as file:
+        _fill(file, recording)
+        file.flush()
+        return file.id.get_file_image()
 
 
 def _fill(file: h5py.File, recording: Recording) -> None:
@@ -66,18 +70,3 @@ def _fill(file: h5py.File, recording: Recording) -> None:
         many = values.ndim > 2 and values.size > 0
         options = {"chunks": (1, *values.shape[1:]), "compression": "gzip", "shuffle": True} if many else {}
         file.create_dataset(dataset, data=values, **options)
-
-
-def _flush(name: str) -> None:
-    descriptor = os.open(name, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-
-
-def _umask() -> int:
-    """The process's file mode mask: mkstemp ignores it, but the file should be as readable as any other."""
-    current = os.umask(0)
-    os.umask(current)
-    return current

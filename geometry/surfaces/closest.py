@@ -57,7 +57,7 @@ class SurfaceIndex:
         self._tree = cKDTree(search.points, leafsize=12)
 
     def query(self, points: np.ndarray) -> Closest:
-        """The closest surface point of each of `points (n, D)`, m.
+        """The closest surface point of each of the points (n, D), m.
 
         Raises:
             ValueError: points that are not finite or of the wrong shape.

@@ -39,8 +39,8 @@ def signed_distance(grid: Grid, surface: Surface, *, band: float | None = None) 
     24,375 nodes: 0.8 s.
 
     Raises:
-        SurfaceError: the surface is open or inside out.
-        ValueError: the dimensions differ, or the band is not positive.
+        SurfaceError: a surface that is open or inside out.
+        ValueError: dimensions that differ, a band that is not positive.
     """
     return distance_and_closest(grid, surface, band=band).distance
 

@@ -26,11 +26,14 @@ class SurfaceError(ValueError):
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """Vertices `(nv, D)`, m, faces `(nf, D)` of vertex numbers, and a region label `(nf,)` for each face.
+    """Faces between vertices, in space (D = 3) or in a plane (D = 2).
 
-    Region 0 is wall, 1 the mitral inlet, 2 the aortic outlet; further labels are free. D is 2 or 3.
-    Closedness and orientation are not required to build one: `check` does that, `repaired` (see `repair`)
-    mends.
+    Closedness and orientation are not required to build one: `check` does that, `repaired` (see `repair`) mends.
+
+    Args:
+        vertices: (nv, D), m.
+        faces: (nf, D), vertex numbers.
+        region: (nf,), labels: 0 wall, 1 mitral inlet, 2 aortic outlet, further ones free; None: all 0.
 
     Raises:
         SurfaceError: shapes that do not fit, vertices that are not finite, face indices out of range.

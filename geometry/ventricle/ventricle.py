@@ -72,12 +72,19 @@ class Beat:
 class Ventricle:
     """The shape at end diastole (m) and its beat. Regions: 0 wall, 1 mitral inlet, 2 aortic outlet.
 
-    `length` from base to apex; `semi_major`, `semi_minor` of the spheroid along z and across;
-    `mitral_centre`, `mitral_semi_axes` (along x, y) and `aortic_centre`, `aortic_radius` in the base plane;
-    `axial_share` is the k of the module's formula.
+    Args:
+        length: m, from base to apex.
+        semi_major: m, of the spheroid, along z.
+        semi_minor: m, across.
+        mitral_centre: (x, y), m, in the base plane.
+        mitral_semi_axes: m, along x and y.
+        aortic_centre: (x, y), m, in the base plane.
+        aortic_radius: m.
+        axial_share: the k of the module's formula.
+        beat: the volume over time, and when the valves are open.
 
     Raises:
-        ValueError: orifices leave the base or meet.
+        ValueError: orifices that leave the base or meet.
     """
 
     length: float = 0.030

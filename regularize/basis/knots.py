@@ -49,7 +49,7 @@ class Knots:
 
     @property
     def axes(self) -> int:
-        """A of the grid: 2 or 3, one more where time is an axis."""
+        """A."""
         return len(self.cells)
 
     @property
@@ -59,7 +59,7 @@ class Knots:
 
     @property
     def nodes(self) -> int:
-        """Coefficients of one component in the whole grid."""
+        """Number of coefficients of a component."""
         return reduce(lambda a, b: a * b, self.shape, 1)
 
     @property

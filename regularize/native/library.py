@@ -30,7 +30,7 @@ from regularize.rows.ordering import Ordering
 from . import build, loader
 
 FAMILY = loader.Family(build.LIBRARIES, build.STEM, "spline_runs", "regularize.native.build")
-KINDS: dict[type[PointRows], int] = {VectorRows: 0, DirectionRows: 1, DivergenceRows: 2}
+KINDS = {VectorRows: 0, DirectionRows: 1, DivergenceRows: 2}
 
 
 class _Grid(ctypes.Structure):
@@ -81,16 +81,12 @@ def available() -> bool:
     return library() is not None
 
 
-def loaded() -> ctypes.CDLL:
-    """The library of :func:`library`, which must be there.
-
-    Raises:
-        LibraryMissing: nothing was compiled, or what was compiled cannot be loaded.
-    """
-    handle = library()
-    if handle is None:
-        raise loader.LibraryMissing(f"no compiled library in {FAMILY.folder}: run `python -m {FAMILY.build}`")
-    return handle
+def _loaded() -> ctypes.CDLL:
+    """The library, where somebody has asked for compiled code."""
+    lib = library()
+    if lib is None:
+        raise InvalidInput("no compiled library was built with this install: use the engine 'reference'")
+    return lib
 
 
 def _address(tensor: torch.Tensor | None) -> ctypes.c_void_p:
@@ -103,7 +99,7 @@ def _size(band: torch.Tensor) -> tuple[ctypes.c_void_p, ctypes.c_int64, ctypes.c
 
 def factorise(band: torch.Tensor, reach: torch.Tensor) -> bool:
     """As :func:`regularize.cholesky.factorise`."""
-    lib = loaded()
+    lib = _loaded()
     lib.spline_set_threads(torch.get_num_threads())
     run = lib.spline_factor_f64 if band.dtype == torch.float64 else lib.spline_factor_f32
     return bool(run(*_size(band), _address(reach)))
@@ -111,7 +107,7 @@ def factorise(band: torch.Tensor, reach: torch.Tensor) -> bool:
 
 def solve(band: torch.Tensor, reach: torch.Tensor, right: torch.Tensor, *, lower: bool, upper: bool) -> torch.Tensor:
     """x (n, k) with L x = right, L' x = right or, with both, L L' x = right for the factor L in the band."""
-    lib, x = loaded(), right.T.contiguous().clone()
+    lib, x = _loaded(), right.T.contiguous().clone()
     lib.spline_set_threads(torch.get_num_threads())
     run = lib.spline_solve_f64 if band.dtype == torch.float64 else lib.spline_solve_f32
     parts = ctypes.c_int32(lower + 2 * upper)
@@ -126,7 +122,7 @@ class PackedSystem:
     """
 
     def __init__(self, system: System, ordering: Ordering) -> None:
-        self.system, self.ordering, self.lib = system, ordering, loaded()
+        self.system, self.ordering, self.lib = system, ordering, _loaded()
         self._keep: list[object] = []
         knots, tile = ordering.knots, self.lib.spline_tile_width()
         place = [ordering.axes.index(k) for k in range(system.components)]
@@ -206,10 +202,10 @@ class PackedSystem:
         self.sorted.append(slot if isinstance(block, CellRows) else index)
         if isinstance(block, CellRows):
             return self._pack_cells(block, start)
-        points = at_points(block)
-        t = points.t[:, list(self.ordering.axes)][index].double()
-        same = _Rows(kind=KINDS[type(points)], count=len(points), start=self._pointer(start), t=self._pointer(t))
-        return self._reweighed(points, same, index)
+        rows = at_points(block)
+        t = rows.t[:, list(self.ordering.axes)][index].double()
+        same = _Rows(kind=KINDS[type(rows)], count=len(rows), start=self._pointer(start), t=self._pointer(t))
+        return self._reweighed(rows, same, index)
 
     def _reweighed(self, block: PointRows, same: _Rows, index: torch.Tensor) -> _Rows:
         """``same`` rows, sorted by ``index``, with the weights and directions of ``block``."""

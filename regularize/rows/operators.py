@@ -85,11 +85,11 @@ class VectorRows(PointRows):
         self.target = (self.weight * target).flatten()
 
     def rows_at(self, index: slice | torch.Tensor) -> torch.Tensor:
-        """(n, local_size) basis values at the points, the same for every component; unweighted."""
+        """(n, local_size), the same for every component; unweighted."""
         return self.knots.stencil(self.t[index])
 
     def matvec(self, c: torch.Tensor) -> torch.Tensor:
-        """(nodes, C) -> (n * C,), the components of a point side by side."""
+        """(nodes, C) -> (n * C,), component fastest."""
         out = torch.empty(len(self), self.components, dtype=c.dtype, device=c.device)
         for part in self._chunks():
             near = c[self.knots.local_nodes(self.cell[part])]
@@ -97,7 +97,7 @@ class VectorRows(PointRows):
         return (self.weight.to(c.dtype) * out).flatten()
 
     def rmatvec(self, r: torch.Tensor) -> torch.Tensor:
-        """(n * C,) -> (nodes, C), the exact adjoint of :meth:`matvec`."""
+        """(n * C,) -> (nodes, C), the exact adjoint."""
         r = self.weight.to(r.dtype) * r.view(len(self), self.components)
         out = torch.zeros(self.knots.nodes, self.components, dtype=r.dtype, device=r.device)
         for part in self._chunks():
@@ -191,7 +191,7 @@ class DirectionRows(_CoupledRows):
         self.direction = direction
 
     def rows_at(self, index: slice | torch.Tensor) -> torch.Tensor:
-        """(n, local_size, C) basis values times the direction at each point; unweighted."""
+        """(n, local_size, C), unweighted."""
         return self.knots.stencil(self.t[index])[:, :, None] * self.direction[index][:, None, :]
 
 
@@ -202,7 +202,7 @@ class DivergenceRows(_CoupledRows):
         super().__init__(knots, points, components, torch.zeros_like(points[:, 0]), weight)
 
     def rows_at(self, index: slice | torch.Tensor) -> torch.Tensor:
-        """(n, local_size, C): component k holds derivatives along axis k, 1/m; unweighted."""
+        """(n, local_size, C), 1/m, unweighted."""
         axes, t = self.knots.axes, self.t[index]
         columns = [self.knots.stencil(t, [int(a == k) for a in range(axes)]) for k in range(self.components)]
         return torch.stack(columns, dim=-1)
@@ -224,14 +224,14 @@ class CellRows:
         self.target = torch.zeros(rows, dtype=factor.dtype, device=factor.device)
 
     def matvec(self, c: torch.Tensor) -> torch.Tensor:
-        """(nodes, C) -> (cells * rows,), or (cells * rows * C,) where no components are coupled."""
+        """(nodes, C) -> (rows,)."""
         near, factor = c[self.nodes], self.factor.to(c.dtype)
         if self.coupled:
             return (near.flatten(1) @ factor.flatten(1).T).flatten()
         return torch.einsum("rl,nlc->nrc", factor, near).flatten()
 
     def rmatvec(self, r: torch.Tensor) -> torch.Tensor:
-        """The rows' values -> (nodes, C), the exact adjoint of :meth:`matvec`."""
+        """(rows,) -> (nodes, C), the exact adjoint."""
         count, factor = len(self.cell), self.factor.to(r.dtype)
         if self.coupled:
             values = (r.view(count, -1) @ factor.flatten(1)).view(-1, self.components)
@@ -257,11 +257,11 @@ class System:
 
     @property
     def unknowns(self) -> int:
-        """Coefficients of all components: columns of the matrix."""
+        """Coefficients of all components."""
         return self.knots.nodes * self.components
 
     def target(self) -> torch.Tensor:
-        """(rows,), the weighted right-hand side b of all blocks."""
+        """(rows,), weighted right-hand sides of all blocks."""
         return torch.cat([block.target for block in self.blocks])
 
     def matvec(self, x: torch.Tensor) -> torch.Tensor:

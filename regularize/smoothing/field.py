@@ -38,7 +38,7 @@ class SplineField:
 
     @property
     def components(self) -> int:
-        """C, components of the velocity."""
+        """C."""
         return len(self.coefficients)
 
     def supported(self, points: torch.Tensor) -> torch.Tensor:

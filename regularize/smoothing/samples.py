@@ -77,7 +77,7 @@ class FitData:
 
     @property
     def components(self) -> int:
-        """C, components of the velocity."""
+        """D, of the velocity."""
         return self.velocity.shape[1]
 
     @property

@@ -21,16 +21,16 @@ class Direct:
 
     @property
     def factors(self) -> bool:
-        """Where the factor is not one in float32, which cannot give posterior variances."""
+        """In float64 alone."""
         return not self.single
 
     @property
     def starts_from_neighbour(self) -> bool:
-        """Never: a factorisation needs no first guess."""
+        """Never."""
         return False
 
     def solve(self, system: System, limits: Limits, neighbour: Neighbour | None = None) -> Solved:
-        """Factor and refine; the neighbour is ignored. See :func:`solve_direct`."""
+        """As :func:`solve_direct`."""
         return solve_direct(system, tolerance=limits.tolerance, single=self.single, strict=limits.strict)
 
 

@@ -6,6 +6,7 @@ b = w t, dL/db = w (s.z) and dL/dw = b (s.z) - 2 w (s.x)(s.z) at fixed b. No ite
 """
 
 from dataclasses import replace
+from typing import Any
 
 import torch
 
@@ -16,22 +17,10 @@ from .interface import CholeskyFactor, Solution, Solved
 from .prepared import PreparedSystem
 
 
-class _Context(torch.autograd.function.FunctionCtx):
-    """What the forward pass leaves for the backward pass."""
-
-    saved_tensors: tuple[torch.Tensor, torch.Tensor]
-    block: VectorRows
-    solution: Solution
-    factor: CholeskyFactor
-    prepared: PreparedSystem
-
-
 class _ImplicitSolve(torch.autograd.Function):
-    """The solution as a function of the first block's weights and targets."""
-
     @staticmethod
     def forward(
-        ctx: "_Context",
+        ctx: Any,
         weight: torch.Tensor,
         target: torch.Tensor,
         block: VectorRows,
@@ -44,7 +33,7 @@ class _ImplicitSolve(torch.autograd.Function):
         return solution.x.clone()
 
     @staticmethod
-    def backward(ctx: "_Context", gradient: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, None, None, None, None]:
+    def backward(ctx: Any, gradient: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         weight, target = ctx.saved_tensors
         prepared, plain = ctx.prepared, ctx.block.with_unit_weight()
         shape = (prepared.system.knots.nodes, prepared.system.components)

@@ -45,16 +45,16 @@ class Krylov:
 
     @property
     def factors(self) -> bool:
-        """Never: only products with the rows are formed."""
+        """None."""
         return False
 
     @property
     def starts_from_neighbour(self) -> bool:
-        """Never: the iteration begins at zero."""
+        """Never."""
         return False
 
     def solve(self, system: System, limits: Limits, neighbour: Neighbour | None = None) -> Solved:
-        """Iterate on the rows, or on the stored matrix; the neighbour is ignored and no factor returned."""
+        """By the method, on applied or stored rows."""
         matvec, rmatvec = sparse_operators(system) if limits.stored else (system.matvec, system.rmatvec)
         solution = self.method(
             matvec,

@@ -22,21 +22,16 @@ class NeighbourGradients:
 
     @property
     def factors(self) -> bool:
-        """Always: the first frame is factored, and its factor serves the frames that follow."""
+        """Where there is no neighbour."""
         return True
 
     @property
     def starts_from_neighbour(self) -> bool:
-        """Always, where there is a neighbour."""
+        """Where there is one."""
         return True
 
     def solve(self, system: System, limits: Limits, neighbour: Neighbour | None = None) -> Solved:
-        """Conjugate gradients from the neighbour's coefficients, with its factor as preconditioner.
-
-        Raises:
-            InvalidInput: the neighbour holds no factor, or lies on other knots.
-            NotConverged: neither the iteration nor a factorisation of its own reached the tolerance.
-        """
+        """As :func:`pcg`, at most ITERATIONS of them; else directly."""
         if neighbour is None:
             return solve_direct(system, tolerance=limits.tolerance, strict=limits.strict)
         if neighbour.factor is None or neighbour.knots != system.knots:

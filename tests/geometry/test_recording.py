@@ -149,6 +149,25 @@ def _remove(dataset: str) -> Callable[[h5py.File], None]:
 
 
 INSIDE = (0, 0, 2, 2, 2)
+
+
+def _many_periods(file: h5py.File) -> None:
+    file.attrs["period"], file["time"][2] = 1e-3, 11.0
+
+
+def _in_millimetres(file: h5py.File) -> None:
+    for name in ("origin", "spacing"):
+        file["grid"].attrs[name] *= 1e3
+    file["wall/vertices"][...] *= 1e3
+
+
+def _unused_vertex(file: h5py.File) -> None:
+    for name, value in (("vertices", 0.5), ("velocity", 0.0)):
+        values = file[f"wall/{name}"][()]
+        del file[f"wall/{name}"]
+        file[f"wall/{name}"] = np.concatenate([values, np.full_like(values[:, :1], value)], axis=1)
+
+
 RULES: list[tuple[str, Callable[[h5py.File], None], str]] = [
     *[
         (f"missing {name}", _remove(name), f"/{name}: is required but missing")
@@ -213,6 +232,20 @@ RULES: list[tuple[str, Callable[[h5py.File], None], str]] = [
     ("no version", _attribute("/", "format_version", None), "attribute format_version: is required"),
     ("no rho", _attribute("/", "rho", None), "attribute rho: is required"),
     ("rho 0", _attribute("/", "rho", 0.0), "attribute rho: must be a positive density"),
+    ("rho 1e300", _attribute("/", "rho", 1e300), "attribute rho: must be a positive density"),
+    ("mu 1e300", _attribute("/", "mu", 1e300), "attribute mu: must be finite and not negative"),
+    ("period 1e-12", _attribute("/", "period", 1e-12), "attribute period: is 1e-12 s, shorter than every beat"),
+    ("period 1e300", _attribute("/", "period", 1e300), "attribute period: must be finite"),
+    ("many periods", _many_periods, "attribute period: is 0.001 s, of which the frames span more"),
+    ("time 1e300", _set("time", (2,), 1e300), "/time: reaches 1e[+]300 s"),
+    ("spacing 1e300", _attribute("grid", "spacing", [1e300] * 3), "/grid: spacing must lie between"),
+    ("spacing 1e-30", _attribute("grid", "spacing", [0.001, 1e-30, 0.001]), "/grid: spacing must lie between"),
+    ("origin 1e300", _attribute("grid", "origin", [1e300, 0.0, 0.0]), "/grid: the box .* lies farther than"),
+    ("lengths in mm", _in_millimetres, "/grid: is 12.5 m large, so it is probably in mm"),
+    ("vertices 1e300", _set("wall/vertices", (0, 0, 0), 1e300), "/wall/vertices: reaches 1e[+]300 m"),
+    ("unused vertex", _unused_vertex, "/wall/vertices: vertices that no face uses lie up to"),
+    ("100,000 rows", _replace("valve/intervals", lambda v: np.tile(v[:1], (100_000, 1))), "holds 100000 rows"),
+    ("valve 1e300", _set("valve/intervals", (0, 1), -1e300), "/valve/intervals: times must lie within"),
     ("mu negative", _attribute("/", "mu", -1.0), "attribute mu: must be finite and not negative"),
     ("mu text", _attribute("/", "mu", "water"), "attribute mu: must be one number"),
     ("period NaN", _attribute("/", "period", np.nan), "attribute period: must be finite"),

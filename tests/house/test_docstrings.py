@@ -35,12 +35,21 @@ def fields_by_class() -> dict[str, set[str]]:
             if not isinstance(node, ast.ClassDef):
                 continue
             names = {n.target.id for n in node.body if isinstance(n, ast.AnnAssign) and isinstance(n.target, ast.Name)}
+            names |= {
+                n.targets[0].id for n in node.body if isinstance(n, ast.Assign) and isinstance(n.targets[0], ast.Name)
+            }
             for method in node.body:
                 if isinstance(method, ast.FunctionDef) and method.name == "__init__":
-                    names |= set(arguments(method))
+                    names |= set(arguments(method)) | set_on_self(method)
             own[node.name] = own.get(node.name, set()) | names
             bases[node.name] = [ast.unparse(base).split("[")[0].split(".")[-1] for base in node.bases]
     return {name: set().union(*(own[c] for c in _ancestry(name, bases) if c in own)) for name in own}
+
+
+def set_on_self(method: ast.FunctionDef) -> set[str]:
+    """Names of the attributes that a method gives its object."""
+    stored = [n for n in ast.walk(method) if isinstance(n, ast.Attribute) and isinstance(n.ctx, ast.Store)]
+    return {n.attr for n in stored if isinstance(n.value, ast.Name) and n.value.id == "self"}
 
 
 def _ancestry(name: str, bases: dict[str, list[str]]) -> set[str]:

@@ -12,6 +12,9 @@ import sys
 import traceback
 import warnings
 from collections.abc import Sequence
+from typing import TextIO
+
+from .terminal import printable
 
 __all__ = ["main"]
 
@@ -21,32 +24,42 @@ DEBUG = "TORCHSPH_TRACEBACK"
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code (argparse itself leaves with 2 by `SystemExit`)."""
-    from .program import build_parser
-
-    args = build_parser().parse_args(arguments)
+    command = ""
     try:
+        from .program import build_parser  # here, so that an interruption of the long imports is one as well
+
+        args = build_parser().parse_args(arguments)
+        command = args.command
         with warnings.catch_warnings():
             warnings.showwarning = _warn
             args.run(args)
-        sys.stdout.flush()
+        if sys.stdout is not None:  # closed by the caller: the files are what counts
+            sys.stdout.flush()
     except KeyboardInterrupt:
-        return _fail(args.command, "interrupted", 130)
+        return _fail(command, "interrupted", 130)
     except BrokenPipeError:  # the reader of the table went away (`| head`); nothing is wrong here
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except (ValueError, OSError) as error:
-        return _fail(args.command, _text(error), 2)
+        return _fail(command, _text(error), 2)
     except MemoryError:
-        return _fail(args.command, "out of memory; try fewer --members or a larger --spacing", 1)
+        return _fail(command, "out of memory; try fewer --members or a larger --spacing", 1)
     except Exception as error:
-        return _fail(args.command, f"{type(error).__name__}: {error} ({DEBUG}=1 shows where)", 1)
+        return _fail(command, f"{type(error).__name__}: {error} ({DEBUG}=1 shows where)", 1)
     return 0
 
 
-def _warn(message: Warning | str, category: type[Warning], *_: object) -> None:
+def _warn(
+    message: Warning | str,
+    category: type[Warning],
+    filename: str,
+    lineno: int,
+    file: TextIO | None = None,
+    line: str | None = None,
+) -> None:
     """One line for what the user should know; what is meant for programmers stays silent."""
     if category is UserWarning:
-        print(f"torchsph: warning: {' '.join(str(message).split())}", file=sys.stderr)
+        print(f"torchsph: warning: {printable(' '.join(str(message).split()))}", file=sys.stderr)
 
 
 def _text(error: Exception) -> str:
@@ -58,5 +71,6 @@ def _text(error: Exception) -> str:
 def _fail(command: str, message: str, code: int) -> int:
     if os.environ.get(DEBUG):
         traceback.print_exc()
-    print(f"torchsph {command}: error: {' '.join(message.split())}", file=sys.stderr)
+    line = f"{f'torchsph {command}'.rstrip()}: error: {' '.join(message.split())}"
+    print(printable(line), file=sys.stderr)
     return code

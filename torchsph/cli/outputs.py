@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import math
 import os
@@ -14,7 +15,11 @@ from typing import Any
 
 import numpy as np
 
+from geometry.recordings.whole_file import refuse_special
+
 __all__ = ["output_folder", "staged", "write_json"]
+
+_SCRATCH = ".torchsph-"
 
 
 def output_folder(path: str | Path) -> Path:
@@ -33,18 +38,51 @@ def output_folder(path: str | Path) -> Path:
 
 @contextmanager
 def staged(folder: str | Path) -> Iterator[Path]:
-    """A scratch folder whose files move into `folder` when the block ends well, and vanish otherwise."""
+    """A scratch folder whose files move into `folder` when the block ends well, and vanish otherwise.
+
+    Scratch folders of runs that were killed are removed first. A file never takes the place of a link, a device or a
+    folder: `FileExistsError` before any file has moved.
+    """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    scratch = Path(tempfile.mkdtemp(prefix=".torchsph-", dir=folder))
+    _sweep(folder)
+    scratch, lock = _locked_scratch(folder)
     try:
         yield scratch
-        for file in sorted(scratch.iterdir()):
+        files = sorted(scratch.iterdir())
+        for file in files:
+            refuse_special(folder / file.name)
+        for file in files:
             os.replace(file, folder / file.name)
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
+        os.close(lock)
         with suppress(OSError):  # the folder holds files already: the usual case, and then it stays
             folder.rmdir()
+
+
+def _locked_scratch(folder: Path) -> tuple[Path, int]:
+    """A new scratch folder and the handle that locks it for as long as this process lives."""
+    while True:
+        scratch = Path(tempfile.mkdtemp(prefix=_SCRATCH, dir=folder))
+        handle = os.open(scratch, os.O_RDONLY)
+        with suppress(OSError):  # a file system without locks: then nobody can sweep, either
+            fcntl.flock(handle, fcntl.LOCK_EX)
+        if scratch.exists():  # else another run has swept it between the two steps
+            return scratch, handle
+        os.close(handle)
+
+
+def _sweep(folder: Path) -> None:
+    """Remove the scratch folders whose runs are gone: nobody holds their lock."""
+    for left in folder.glob(f"{_SCRATCH}*"):
+        with suppress(OSError):
+            handle = os.open(left, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+            try:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                shutil.rmtree(left, ignore_errors=True)
+            finally:
+                os.close(handle)
 
 
 def write_json(path: str | Path, content: Any) -> None:

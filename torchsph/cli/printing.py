@@ -11,6 +11,8 @@ import torch
 
 from torchsph import __version__
 
+from .terminal import printable
+
 
 def run_config(args: argparse.Namespace, **extra: Any) -> dict[str, Any]:
     """What was asked for, with versions, for `metrics.json`; ``extra`` goes over what has its name."""
@@ -20,6 +22,7 @@ def run_config(args: argparse.Namespace, **extra: Any) -> dict[str, Any]:
 
 def print_table(rows: Sequence[Sequence[str]], text: bool = False) -> None:
     """Columns lined up: the first to the left, numbers to the right."""
+    rows = [[printable(cell) for cell in row] for row in rows]
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
     for row in rows:
         first, *rest = zip(row, widths, strict=True)

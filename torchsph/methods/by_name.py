@@ -91,9 +91,11 @@ def run_methods(
     smoother, timer = make_smoother(preset), _Timer()
     prepared = PreparedMeasurement(measured, smoother, progress=progress)
     smoothed = prepared.smoothed  # by all processes together
+    found = prepared.splines.estimates.summary()
+    mended = {"estimates": found} if found else {}
     results: dict[str, MethodResult] = {}
     if "spline" in methods:
-        results["spline"] = timer.result(smoothed, {"smoother": repr(smoother)})
+        results["spline"] = timer.result(smoothed, {"smoother": repr(smoother), **mended})
     spacing = ANALYSIS_SPACING * min(measured.grid.spacing) if spacing is None else spacing
     model = make_model(measured, preset=preset, spacing=spacing, device=device)
     if is_last() and set(methods) != {"spline"}:
@@ -115,7 +117,7 @@ def run_methods(
             seed=seed,
             progress=progress,
         )
-        results["ensemble"] = timer.result(ensemble.recording, ensemble.info)
+        results["ensemble"] = timer.result(ensemble.recording, ensemble.info | mended)
     return _collected(results)
 
 

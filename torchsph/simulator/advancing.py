@@ -81,7 +81,9 @@ class AdvancingRun:
     def advance(self, until: float) -> None:
         """Step every member that has not failed to time ``until`` (s), each with its own time step.
 
-        Raises NumericalFailure when no member is left; a member that fails before is frozen and flagged.
+        Raises:
+            NumericalFailure: no member is left; a member that fails before is frozen and flagged.
+            ValueError: ``until`` lies in the past.
         """
         if until < self.time:
             raise ValueError(f"cannot advance backwards, from {self.time} s to {until} s")

@@ -39,8 +39,13 @@ class GridForecast:
     """A forecast on its way: starts from velocity grids of all members, gives velocity grids at later times.
 
     Args:
-        model: the simulator. grid, mask (*shape) bool: where the velocity is known at ``time`` (s).
+        model: the simulator.
+        grid: the nodes, m.
         velocity: (D, *shape) for one member or (members, D, *shape), m/s.
+        mask: (*shape) bool, where it is known.
+        time: s.
+        transfer: between grid and particles.
+        seed: of the particles.
 
     Attributes:
         run: the simulation.
@@ -81,5 +86,5 @@ class GridForecast:
         found = self.run.fetch(self.grid, mask)
         if self._lost is None or self.transfer.fade is None:
             return found.value, found.covered
-        share = math.exp(-(time - self.start_time) / self.transfer.fade)
-        return found.value + share * self._lost * found.covered[:, None], found.covered
+        fading = math.exp(-(time - self.start_time) / self.transfer.fade)
+        return found.value + fading * self._lost * found.covered[:, None], found.covered

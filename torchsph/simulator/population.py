@@ -1,4 +1,6 @@
-"""Population control (thesis 5.2): particles that crowd are merged, holes are seeded again from what is around them.
+"""Population control: particles that crowd are merged, holes are seeded again from what is around them.
+
+It was asked for in Grønli 2017, sec. 5.2.
 
 Mass and momentum only change hands: a merged particle has those of the two it replaces, a seeded one takes its share
 from the particles around it.  What flows through valves is left to the reservoirs and their accounts.
@@ -61,7 +63,8 @@ class Population:
     ) -> Population | None:
         """The control that the domain's scheme asks for, or None.
 
-        Raises ValueError where the particles do not fill what encloses them.
+        Raises:
+            ValueError: the particles do not fill what encloses them.
         """
         domain, scheme = surroundings.domain, surroundings.domain.scheme
         if scheme.population is None:
@@ -79,21 +82,21 @@ class Population:
         """Merge and seed in the members where ``due`` (members,) bool; True where that has changed the set."""
         before = particles
         if self.options.closest is not None:
-            particles = self._merged(particles, due)
+            particles = self._merged(particles, due, self.options.closest)
         if self.options.missing is not None:
-            particles = self._seeded(particles, due)
+            particles = self._seeded(particles, due, self.options.missing)
         return particles, particles is not before
 
-    def _merged(self, particles: Particles, due: Tensor) -> Particles:
+    def _merged(self, particles: Particles, due: Tensor, closest: float) -> Particles:
         """Merge the pairs nearer than ``closest``: cells of twice that size, in every half-shifted arrangement."""
-        edge = 2.0 * self.options.closest
+        edge = 2.0 * closest
         for shift in itertools.product((0.0, 0.5 * edge), repeat=particles.dimension):
             row = torch.nonzero(particles.inside & due[particles.member]).squeeze(1)
             place, cell, _ = self._cells(particles, row, edge, shift)
             order = torch.argsort(cell, stable=True)
             first, second = order[:-1], order[1:]
             near = cell[first] == cell[second]
-            near &= square_length(place[first] - place[second]) < self.options.closest**2
+            near &= square_length(place[first] - place[second]) < closest**2
             near &= particles.mass[row[first]] + particles.mass[row[second]] < self.options.heaviest
             # of three in a row the middle one can merge once only
             near[1:] &= ~near[:-1]
@@ -112,11 +115,11 @@ class Population:
             value = getattr(particles, name)
             if value is None:
                 continue
-            way = value[second] - value[first]
+            difference = value[second] - value[first]
             if name == "position":
-                way = nearest_image(way, self.domain.period)
+                difference = nearest_image(difference, self.domain.period)
             weight = part.reshape(-1, *[1] * (value.ndim - 1))
-            changes[name] = value.index_copy(0, first, value[first] + weight * way)
+            changes[name] = value.index_copy(0, first, value[first] + weight * difference)
         keep = torch.ones_like(particles.fluid).index_fill(0, second, False)
         self._record.merged.index_add_(0, particles.member[second], torch.ones_like(second))
         return particles.changed(**changes).select(keep)
@@ -141,12 +144,12 @@ class Population:
             cell = cell * counts[axis] + index[:, axis]
         return place, cell, (origin, size, counts)
 
-    def _seeded(self, particles: Particles, due: Tensor) -> Particles:
+    def _seeded(self, particles: Particles, due: Tensor, missing: float) -> Particles:
         """Seed the empty cells, one spacing wide, in whose middle the kernels' sum falls short."""
         row = torch.nonzero(particles.inside).squeeze(1)
         if not row.numel():
             return particles
-        place, member = self._holes(particles, row, due)
+        place, member = self._holes(particles, row, due, missing)
         if not place.shape[0]:
             return particles
         sought = torch.zeros_like(due).index_fill(0, member, True)
@@ -162,15 +165,16 @@ class Population:
         self._record.reseeded.index_add_(0, member, torch.ones_like(member))
         return self._taken(particles, row, place, member, around)
 
-    def _holes(self, particles: Particles, row: Tensor, due: Tensor) -> tuple[Tensor, Tensor]:
+    def _holes(self, particles: Particles, row: Tensor, due: Tensor, missing: float) -> tuple[Tensor, Tensor]:
         """Places (n, D) where particles are missing, and their members (n,)."""
         _, cell, (origin, size, counts) = self._cells(particles, row, 1.0, (0.0,) * particles.dimension)
         total = int(counts.prod())
-        held = torch.zeros(particles.members * total, dtype=torch.bool, device=cell.device)
-        held[cell] = True
-        empty = ~held.reshape(particles.members, total) & due[:, None]
+        occupied = torch.zeros(particles.members * total, dtype=torch.bool, device=cell.device)
+        occupied[cell] = True
+        empty = ~occupied.reshape(particles.members, total) & due[:, None]
         number = torch.nonzero(empty.any(0)).squeeze(1)
-        index, left = [], number
+        index: list[Tensor] = []
+        left = number
         for axis in range(particles.dimension - 1, -1, -1):
             index.insert(0, left % counts[axis])
             left = left // counts[axis]
@@ -180,16 +184,16 @@ class Population:
         if self.domain.walls is not None and number.numel():
             wall = self._surroundings.sample_at(centre)
             # without the kernel's completeness the sum means nothing where walls cut the kernel
-            complete = isinstance(wall, CompleteWallSample)
-            clear = _CLEARANCE if complete else self._support.radius
+            clear = self._support.radius
+            if isinstance(wall, CompleteWallSample):
+                clear, completeness = _CLEARANCE, wall.completeness
             fit = (wall.distance > clear) & ~self._surroundings.beyond_valves(centre)
-            completeness = wall.completeness if complete else completeness
         member, which = torch.nonzero(empty[:, number[fit]], as_tuple=True)
         centre, completeness = centre[fit][which], completeness[fit][which]
         if not member.numel():
             return centre, member
         covered = self._sums(particles, particles.mass[:, None], centre, member).value
-        hole = covered < completeness * (1.0 - self.options.missing * self._peak)
+        hole = covered < completeness * (1.0 - missing * self._peak)
         return centre[hole], member[hole]
 
     def _sums(self, particles: Particles, fields: Tensor, place: Tensor, member: Tensor) -> Moments:

@@ -110,8 +110,11 @@ class Valve:
     def pressure_at(self, time: float) -> float:
         """The given pressure (Pa) at ``time`` (s).
 
-        Raises ValueError where it is not finite.
+        Raises:
+            ValueError: it is not finite, or none is given.
         """
+        if self.pressure is None:
+            raise ValueError(f"valve of region {self.region} has no given pressure")
         value = float(self.pressure(time) if callable(self.pressure) else self.pressure)
         if not math.isfinite(value):
             raise ValueError(f"Valve.pressure of region {self.region} must be finite (Pa), got {value} at {time:g} s")
@@ -196,7 +199,8 @@ class Scene:
     def gravity_at(self, time: float) -> tuple[float, ...]:
         """The body force per mass (D,), m/s^2, at ``time`` (s).
 
-        Raises ValueError where a function of time returns anything but D finite numbers.
+        Raises:
+            ValueError: a function of time returns anything but D finite numbers.
         """
         if not callable(self.gravity):
             return (0.0,) * self.dimension if self.gravity is None else tuple(self.gravity)
@@ -215,6 +219,7 @@ class Scene:
         the same scene results from a noisy and from a clean recording. Walls that flicker are estimated, and valve
         times that the recording lacks or cannot mean (``geometry.estimated``).
         """
+        recording.wall_for("the simulator")
         recording = geometry.estimated(recording).recording
         intervals = recording.valve_intervals_or_derived()
         regions: dict[int, list[tuple[float, float]]] = {}
@@ -225,7 +230,7 @@ class Scene:
                 opening = float(opening) if math.isfinite(opening) else span[0]
                 closing = float(closing) if math.isfinite(closing) else span[1]
             rows.append((float(opening), float(closing)))
-        present = {int(region) for region in recording.wall.region}
+        present = {int(region) for region in recording.wall_for("the simulator").region}
         valves = tuple(
             Valve(r, tuple(sorted(rows)), recording.period, span) for r, rows in sorted(regions.items()) if r in present
         )

@@ -1,4 +1,4 @@
-"""Where the particles start: the thesis's Boltzmann sampling, or a packed, relaxed quiet start."""
+"""Where the particles start: Boltzmann sampling (Grønli 2017, sec. 3.1.4), or a packed, relaxed quiet start."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from .schemes.wall_models import PotentialWall
 from .schemes.weakly_compressible import WeaklyCompressible
 from .state.neighbour_list import PairSearch
 from .state.particles import FLUID, Particles
+from .state.required import required
 from .stepping.pressure import Neighbourhood, packing
 from .surroundings import PresentSurroundings
 from .walls.interface import complete_sample
@@ -162,7 +163,7 @@ def _uniform(like: Tensor, generator: torch.Generator) -> Tensor:
 
 
 def _boltzmann(surroundings: PresentSurroundings, seeding: Seeding, generator: torch.Generator) -> Tensor:
-    """As many particles as rest volumes fit, one random try per unit cell and sweep (thesis 3.1.4).
+    """As many particles as rest volumes fit, one random try per unit cell and sweep (Grønli 2017, sec. 3.1.4).
 
     U0 is the potential of the free interior, 0. Points beyond the wall are refused whatever their potential.
     """
@@ -220,7 +221,8 @@ def relaxed(surroundings: PresentSurroundings, backend: Backend, position: Tenso
         particles = _resting(position, torch.full_like(position[:, 0], mass))
         state = particles.state(particles.deviation)
         terms = RateTerms(continuity=None, concentration=True)
-        gradient = search.backend.rates(search.at(particles), state, support, terms).concentration
+        sums = search.backend.rates(search.at(particles), state, support, terms)
+        gradient = required(sums.concentration, "the concentration gradient")
         wall = surroundings.sample_at(position)
         move = -0.15 * support.length**2 * (gradient - complete_sample(wall).completeness_gradient)
         length = move.norm(dim=1, keepdim=True)

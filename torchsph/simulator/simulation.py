@@ -57,8 +57,10 @@ class Simulation(AdvancingRun):
     def change(self, **values: float | Sequence[float] | Tensor | None) -> None:
         """Change parameters from now on: one number for all members, or a row (members,) with one for each.
 
-        Names are those of ``Parameters``; None switches a term off. Raises ValueError where a value cannot be, or
-        where the scheme has no place for it.
+        Names are those of ``Parameters``; None switches a term off.
+
+        Raises:
+            ValueError: a value cannot be, or the scheme has no place for it.
         """
         scheme = self.domain.scheme
         if scheme.changeable is not None and not set(values) <= set(scheme.changeable):
@@ -80,10 +82,11 @@ class Simulation(AdvancingRun):
         """Replace the particles' velocities by those of a grid at the present time.
 
         Args:
-            grid: the nodes, m. velocity: (D, *shape) for all members or (members, D, *shape), m/s.
+            grid: the nodes, m.
+            velocity: (D, *shape) for all members or (members, D, *shape), m/s.
             mask: (*shape) bool, where the velocity is known. Beyond it the walls' velocity continues the field.
             confidence: (*shape), not negative, how far each node is to be trusted; the particles carry it along, and it
-                weighs them in XSPH and in fetching (thesis 5.2). None: all alike.
+                weighs them in XSPH and in fetching (Grønli 2017, sec. 5.2). None: all alike.
 
         Raises:
             ValueError: a confidence is negative or not finite.
@@ -116,9 +119,9 @@ class Simulation(AdvancingRun):
         self.surroundings.enter(self.time, self.time)
         wall = self.surroundings.sample(self.particles)
         search = self._stepper.pair_search
-        here = Neighbourhood(self.particles, search, search.at(self.particles), self._stepper.support, wall)
+        neighbourhood = Neighbourhood(self.particles, search, search.at(self.particles), self._stepper.support, wall)
         before = self.particles
-        self.particles = before.changed(velocity=divergence_free(here, times=times))
+        self.particles = before.changed(velocity=divergence_free(neighbourhood, times=times))
         mass = torch.where(before.fluid, before.mass, torch.zeros_like(before.mass)).double()
         taken, left = (
             before.per_member(mass * velocity.double().square().sum(1), "sum")

@@ -25,7 +25,8 @@ class Simulator:
     Args:
         scene: fluid, walls, valves, forces (SI).
         scheme: ``Projection`` or ``WeaklyCompressible`` options; None: the weakly compressible preset, for any scene.
-        device, dtype: where and in what precision particles live (float32 or float64).
+        device: where particles live.
+        dtype: in what precision (float32 or float64).
         backend: name of the pair backend, or "auto" for the best one present.
         seeding: how particles are placed; None takes what the scheme's walls call for.
     """

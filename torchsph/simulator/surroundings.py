@@ -45,7 +45,8 @@ class PresentSurroundings:
         """Choose key frames and open valves for an interval (s) without breaks inside.
 
         Args:
-            start, stop: of the interval, s.
+            start: s, of the interval.
+            stop: s, its end.
             shut: whether every valve is kept shut.
             valve_strength: of the run that goes through it, a number or (members,).
         """

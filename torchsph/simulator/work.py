@@ -57,7 +57,8 @@ class WorkAccount:
         """Account for one step.
 
         Args:
-            before, stepped: the particles before the step and after it, not yet stopped by walls.
+            before: the particles before the step.
+            stepped: the particles after it, not yet stopped by walls.
             wall: what they saw.
             step: (members,), internal.
             stepper: what knows pressure and coefficients.

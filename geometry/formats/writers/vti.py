@@ -56,7 +56,7 @@ def _walls(path: Path, recording: Recording) -> list[Path]:
     from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkPolyData
     from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter
 
-    wall, names = recording.wall_for("VTK files of the wall"), []
+    wall, names = recording.wall_for("the walls' files"), []
     speed = wall_velocity(wall, recording.time)
     flat = 3 - recording.dimension
     for frame in range(recording.frames):

@@ -159,6 +159,20 @@ def test_one_asked_method_becomes_the_analysis(files, tmp_path):
     assert (tmp_path / "analysis.h5").read_bytes() == (tmp_path / "spline.h5").read_bytes()
 
 
+def test_another_method_leaves_the_checkpoint_of_an_ensemble(files, tmp_path):
+    (tmp_path / "checkpoint.pt").write_text("hours of work")
+    assert cli.main(["assimilate", files["measured"], "--method", "spline", "--out", str(tmp_path)]) == 0
+    assert (tmp_path / "checkpoint.pt").read_text() == "hours of work"
+
+
+def test_a_damaged_checkpoint_is_told_before_any_work(files, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(pipeline, "run_methods", None)
+    (tmp_path / "checkpoint.pt").write_text("rubbish")
+    assert cli.main(["assimilate", files["measured"], "--resume", "--out", str(tmp_path)]) == 2
+    told = capsys.readouterr().err
+    assert "checkpoint.pt: is no checkpoint" in told and "remove it" in told and told.count("\n") == 1
+
+
 def test_forecast(files, tmp_path):
     done = torchsph("forecast", files["truth"], "--leads", "0.01,0.005", *QUICK, "--save", "--out", "out", cwd=tmp_path)
     assert done.returncode == 0, done.stderr

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import json
+import signal
+import subprocess
+import sys
 
 import numpy as np
 import pytest
 import torch
 
+from torchsph.cli.main import main
 from torchsph.cli.outputs import output_folder, staged, write_json
+from torchsph.cli.terminal import printable
 
 
 def test_staged_files_arrive_together(tmp_path):
@@ -31,6 +36,50 @@ def test_staged_files_vanish_on_failure_and_others_stay(tmp_path):
     with pytest.raises(RuntimeError), staged(tmp_path / "new"):
         raise RuntimeError
     assert not (tmp_path / "new").exists()
+
+
+def test_the_scratch_folder_of_a_killed_run_is_swept_and_a_living_one_s_is_not(tmp_path):
+    program = "import os, sys\nfrom torchsph.cli.outputs import staged\n"
+    program += "with staged(sys.argv[1]) as scratch:\n    (scratch / 'one').touch()\n    os.kill(os.getpid(), 9)"
+    assert subprocess.run([sys.executable, "-c", program, str(tmp_path)]).returncode == -signal.SIGKILL
+    (dead,) = tmp_path.iterdir()
+    (tmp_path / ".torchsph-link").symlink_to(tmp_path)
+    with staged(tmp_path) as first, staged(tmp_path) as second:
+        assert first.exists() and second.exists() and not dead.exists()
+    assert [path.name for path in tmp_path.iterdir()] == [".torchsph-link"]
+
+
+def test_staged_files_take_the_place_of_no_link(tmp_path):
+    (tmp_path / "target").write_text("somebody's")
+    (tmp_path / "two").symlink_to(tmp_path / "target")
+    with pytest.raises(FileExistsError, match="two: is a symbolic link"), staged(tmp_path) as scratch:
+        (scratch / "one").write_text("1")
+        (scratch / "two").write_text("2")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["target", "two"]
+    assert (tmp_path / "target").read_text() == "somebody's"
+
+
+def test_text_of_files_reaches_the_terminal_in_one_plain_line():
+    assert printable("Müller, 心臓 \u00b5m") == "Müller, 心臓 \u00b5m"
+    assert printable("x\nrecording valid\x1b[2J\x07\u202e\udcfc") == r"x\nrecording valid\x1b[2J\x07\u202e\udcfc"
+    assert len(printable("x" * 60000)) < 2100
+
+
+def test_an_interruption_during_the_imports_is_130(monkeypatch, capsys):
+    class Interrupted:
+        def find_spec(self, name, *_):
+            if name == "torchsph.cli.program":
+                raise KeyboardInterrupt
+
+    monkeypatch.delitem(sys.modules, "torchsph.cli.program", raising=False)
+    monkeypatch.setattr(sys, "meta_path", [Interrupted(), *sys.meta_path])
+    assert main(["info", "--backends"]) == 130
+    assert capsys.readouterr().err == "torchsph: error: interrupted\n"
+
+
+def test_a_closed_stdout_is_no_fault(monkeypatch):
+    monkeypatch.setattr(sys, "stdout", None)
+    assert main(["info", "--backends"]) == 0
 
 
 def test_output_folder_refuses_what_cannot_hold_files(tmp_path):

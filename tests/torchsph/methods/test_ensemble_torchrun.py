@@ -1,5 +1,6 @@
 """The command line under torchrun: two processes write one result, also where one of them is killed."""
 
+import io
 import os
 import signal
 import subprocess
@@ -85,11 +86,16 @@ def worker_of(agent: int, rank: int) -> int | None:
     return None
 
 
+def _packed(checkpoint: Path) -> io.BytesIO:
+    """What torch packed, after the lines that name, check and identify the file."""
+    return io.BytesIO(checkpoint.read_bytes().split(b"\n", 3)[3])
+
+
 def frames_in(checkpoint: Path) -> int:
     if not checkpoint.exists():
         return 0
     try:
-        return len(torch.load(checkpoint, weights_only=True)["state"]["analyses"]["fields"])
+        return len(torch.load(_packed(checkpoint), weights_only=True)["analyses"]["fields"])
     except FileNotFoundError:  # the run has ended and removed it
         return 0
 

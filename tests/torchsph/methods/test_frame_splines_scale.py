@@ -8,7 +8,7 @@ import geometry
 from regularize import Smoother
 from torchsph import smooth
 from torchsph.methods.measurement.frame_splines import FrameSmoother
-from torchsph.methods.wall_rows import at_knots, wall_rows
+from torchsph.methods.measurement.wall_rows import at_knots, wall_rows
 
 
 def turning(points, t):

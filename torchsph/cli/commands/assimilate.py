@@ -14,7 +14,7 @@ from torchsph.assimilation import filter_figure
 from torchsph.evaluation import figures, metrics
 from torchsph.evaluation.scores import Scores
 from torchsph.methods import by_name
-from torchsph.methods.runtime import parallel
+from torchsph.methods.runtime import checkpoint, parallel
 
 from ..arguments import add_model_options, add_output_folder, add_seed, names, whole
 from ..checks import check_spacing, usable_device
@@ -57,6 +57,8 @@ def assimilate(args: argparse.Namespace) -> None:
     check_spacing(args.spacing, measured)
     raw = metrics.evaluate(measured, truth, measured)  # first: a truth that does not fit must not cost a run
     saved = folder / "checkpoint.pt"
+    if args.resume and "ensemble" in methods and parallel.is_lead():
+        checkpoint.refuse_damaged(saved)
     with parallel.joined():
         results = by_name.run_methods(
             measured,
@@ -78,7 +80,8 @@ def assimilate(args: argparse.Namespace) -> None:
     chosen = by_name.DEFAULT_METHOD if by_name.DEFAULT_METHOD in methods else methods[0]
     config = run_config(args, measured=measured_path, truth=truth_path, methods=methods, analysis=chosen)
     _write(folder, measured, truth, results, raw, config)
-    saved.unlink(missing_ok=True)  # the run is complete: there is nothing to go on with
+    if "ensemble" in methods:
+        saved.unlink(missing_ok=True)  # the run is complete: there is nothing to go on with
 
 
 def _write(

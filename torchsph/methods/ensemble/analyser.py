@@ -148,7 +148,10 @@ class Analyser:
             joint, batch.members, batch.observations, state_positions=positions, generator=generator
         )
         earlier = self.analyses.improved(analysis, inside, self.grid.dimension * len(inside))
-        surface = self.splines.motion.surface(float(self.measured.time[frame]))
+        motion = self.splines.motion
+        if motion is None:
+            raise ValueError("the ensemble needs walls (/wall): this measurement has none")
+        surface = motion.surface(float(self.measured.time[frame]))
         return replace(analysis, transform=None), regions_of(batch, control, surface, self.grid), earlier
 
     def _drawn(self, batch: ObservationBatch) -> Tensor:

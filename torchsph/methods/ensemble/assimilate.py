@@ -86,6 +86,8 @@ def assimilate(
         ValueError: fewer than two members, or a checkpoint of another run.
         NumericalFailure: all simulations failed.
     """
+    if resume and checkpoints is not None:
+        checkpoint.refuse_damaged(Path(checkpoints))
     if members < 2:
         raise ValueError(f"an ensemble needs at least 2 members, got {members}")
     if resume and checkpoints is None:
@@ -146,5 +148,8 @@ def _identity(
 ) -> list[object]:
     """What must be the same for a run to go on where another stopped."""
     simulators = [(one.scene.spacing, one.scheme, one.dtype, one.seeding) for one in (model, coarse)]
-    arrays = [array for recording in recordings for array in recording.arrays().values()]
-    return [simulators, filter_, options, members, seed, *arrays]
+    identity: list[object] = [simulators, filter_, options, members, seed]
+    for one in recordings:
+        identity += [one.grid, one.rho, one.mu, one.period]
+        identity += [part for name, array in one.arrays().items() for part in (name, array)]
+    return identity

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-import os
+import io
+import sys
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -12,18 +13,22 @@ import numpy as np
 import torch
 import torch.distributed as dist
 
-_FORMAT = 3
+from geometry.recordings.whole_file import write_whole
+
+_OPENING = b"torchsph checkpoint 4\n"  # then the SHA-256 of all that follows its line, the key, and torch's own file
 
 
 def fingerprint(parts: Iterable[object]) -> str:
-    """A digest of arrays by their bytes and of everything else by its ``repr``."""
-    digest = hashlib.sha256()
+    """A digest of the version, of arrays by their bytes and of everything else by its ``repr``."""
+    version = sys.modules["torchsph"].__version__  # this module's own package: to import it here would be a circle
+    digest = hashlib.sha256(f"torchsph {version}\n".encode())
     for part in parts:
         if isinstance(part, np.ndarray):
             digest.update(str((part.shape, part.dtype)).encode())
             digest.update(np.ascontiguousarray(part).tobytes())
         else:
             digest.update(repr(part).encode())
+        digest.update(b"\n")
     return digest.hexdigest()
 
 
@@ -35,32 +40,68 @@ def save(path: Path, key: str, state: dict[str, Any]) -> None:
     if dist.is_initialized() and dist.get_rank() > 0:
         return
     path.parent.mkdir(parents=True, exist_ok=True)
-    draft = path.with_name(path.name + ".part")
-    with open(draft, "wb") as file:
-        torch.save({"format": _FORMAT, "key": key, "state": state}, file)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(draft, path)
+    packed = io.BytesIO()
+    torch.save(state, packed)
+    body = key.encode() + b"\n" + packed.getvalue()
+    write_whole(path, b"%b%b\n%b" % (_OPENING, hashlib.sha256(body).hexdigest().encode(), body))
+
+
+def refuse_damaged(path: Path) -> None:
+    """Refuse a checkpoint that is cut, changed or none at all, before any work is done.
+
+    Args:
+        path: of the file, which need not be there.
+
+    Raises:
+        ValueError: it cannot be gone on from.
+    """
+    if path.exists():
+        _verified(path)
 
 
 def load(path: Path, key: str) -> dict[str, Any] | None:
     """The state in ``path``, or None where there is none; of several processes the first reads for all.
 
     Raises:
-        ValueError: it was written by another run: other options, members, seed or recordings.
+        ValueError: it is damaged, or was written by another run: other options, members, seed or recordings.
     """
-    held: list[dict[str, Any] | None] = [None]
+    held: list[dict[str, Any] | ValueError | None] = [None]
     lead = not dist.is_initialized() or dist.get_rank() == 0
     if lead and path.exists():
-        held = [torch.load(path, weights_only=True)]
+        try:
+            held = [_state(path, key)]
+        except ValueError as fault:  # told to all processes, which would wait for this one else
+            held = [fault]
     if dist.is_initialized():
         dist.broadcast_object_list(held, 0)
     found = held[0]
-    if found is None:
-        return None
-    if found.get("format") != _FORMAT or found.get("key") != key:
+    if isinstance(found, ValueError):
+        raise found
+    return found
+
+
+def _state(path: Path, key: str) -> dict[str, Any]:
+    """The state of this run."""
+    written, packed = _verified(path)
+    if written != key:
         raise ValueError(
-            f"{path}: belongs to a run with other recordings, options, members or seed; remove it, or resume with the "
-            "same ones"
+            f"{path}: belongs to a run with other recordings, options, members, seed or version of torchsph; resume "
+            "with the same ones, or remove it and start anew"
         )
-    return found["state"]
+    return torch.load(io.BytesIO(packed), weights_only=True)
+
+
+def _verified(path: Path) -> tuple[str, bytes]:
+    """The key and the packed state, whose every bit is the one that was written."""
+    if not path.is_file():
+        raise ValueError(f"{path}: is not a file, so it is no checkpoint; remove it and start anew")
+    content = path.read_bytes()
+    if not content.startswith(_OPENING):
+        rule = "is no checkpoint of this version of torchsph, or its beginning is damaged"
+        raise ValueError(f"{path}: {rule}; remove it and start anew, without --resume")
+    digest, _, body = content[len(_OPENING) :].partition(b"\n")
+    if hashlib.sha256(body).hexdigest().encode() != digest:
+        rule = "is damaged: its bytes are not those that were written (a bad disk, or a copy that was cut)"
+        raise ValueError(f"{path}: {rule}; copy it again, or remove it and start anew, without --resume")
+    key, _, packed = body.partition(b"\n")
+    return key.decode(), packed

@@ -61,7 +61,7 @@ def preset(name: str, **changes: Any) -> Scheme:
 
     "default" is what the command line and the pipelines take: "projection", incompressible, for flow that fills its
     walls. "weakly_compressible" is for every scene, and what a ``Simulator`` takes that is not told; what chose its
-    components is measured in ``examples/benchmarks/preset.py``. "thesis" is table 4.1.
+    components is measured in ``examples/benchmarks/preset.py``. "thesis" is that of Grønli 2017, table 4.1.
     """
     if name not in PRESETS:
         raise ValueError(f"unknown preset '{name}'; known: {', '.join(sorted(PRESETS))}")

@@ -20,16 +20,22 @@ class Projection(Scheme):
     The step is limited by the flow's speed instead of that of sound.
 
     Attributes:
-        kernel: name of the smoothing kernel. smoothing_ratio: smoothing length h over particle spacing.
+        kernel: name of the smoothing kernel.
+        smoothing_ratio: smoothing length h over particle spacing.
         laminar_viscosity: whether the viscosity of the scene's fluid acts, explicitly (Morris et al. 1997).
-        shifting, shifting_speed, shifting_surface: as in ``WeaklyCompressible``.
+        shifting: strength, as in ``WeaklyCompressible``.
+        shifting_speed: as there.
+        shifting_surface: as there.
         relaxation: time in which a particle's excess of number density is let out through the source of the pressure
             (after Khayyer & Gotoh 2011), in spacings per reference speed, or None: left to the shifting alone.
         surface: filling of the kernel below which a particle counts as one of a free surface and has pressure 0, or
             None: the fluid fills its walls, or its periodic box, and pressure is determined up to a constant.
-        tolerance: of the residual relative to the source. iterations: at most, per solve.
-        wall, valve: models for scenes with walls and valves; the valve stays shut with None.
-        courant: fraction of the limits h / v, h^2 / (8 nu) and sqrt(h / |a|) / 2. max_step: s, or None.
+        tolerance: of the residual relative to the source.
+        iterations: at most, per solve.
+        wall: model for scenes with walls.
+        valve: model for scenes with valves; they stay shut with None.
+        courant: fraction of the limits h / v, h^2 / (8 nu) and sqrt(h / |a|) / 2.
+        max_step: s, or None.
         steps_per_frame: at least so many steps between imposed frames, or None.
         population: how particles that crowd are merged and holes seeded again, or None: neither.
     """

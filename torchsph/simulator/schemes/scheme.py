@@ -22,13 +22,15 @@ class Scheme:
         shifting: strength of the particle shifting, or None.
         shifting_speed: the speed in the shifting: "local" or "largest".
         shifting_surface: h times the concentration gradient above which a particle is not shifted, or None.
-        wall: model of the walls. valve: model of the valves; they stay shut with None.
+        wall: model of the walls.
+        valve: model of the valves; they stay shut with None.
         courant: fraction of the limits of the step that is taken.
         steps_per_frame: at least so many steps between imposed frames, or None.
         population: how particles that crowd are merged and holes seeded again, or None: neither.
         max_step: s, longest step, or None.
         step_floor: smallest step as a fraction of the acoustic limit of the fluid at rest, or None.
-        xsph: velocity smoothing, or None. gamma_ramp: how gamma grows after an imposition, or None.
+        xsph: velocity smoothing, or None.
+        gamma_ramp: how gamma grows after an imposition, or None.
         rollback: second chances for members that fail, or None.
     """
 

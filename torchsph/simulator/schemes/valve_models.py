@@ -16,7 +16,7 @@ class ValveOptions(Protocol):
 
 @dataclass(frozen=True)
 class PressureSource:
-    """A timed pressure source at an open valve (3.3, 3.4), softened inside ``core``.
+    """A timed pressure source at an open valve, softened inside ``core`` (Grønli 2017, eqs. 3.3 and 3.4).
 
     The strength Q follows from continuity: the acceleration that changes the flux through the orifice as the volume of
     the cavity demands, spread over a half-sphere around the orifice. ``core`` is in orifice radii.

@@ -36,7 +36,7 @@ class WallModel(Protocol):
 
 @dataclass(frozen=True)
 class PotentialWall:
-    """The thesis's wall (3.1, 3.2): potential U(s) = stiffness c^2 s^2 / 2 with s = 1 - d / reach for d < reach.
+    """Potential U(s) = stiffness c^2 s^2 / 2 with s = 1 - d / reach for d < reach (Grønli 2017, eqs. 3.1 and 3.2).
 
     Attributes:
         stiffness: wall potential at d = 0 in units of c^2 / 2.

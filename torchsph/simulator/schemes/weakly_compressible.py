@@ -25,29 +25,34 @@ class WeaklyCompressible(Scheme):
         kernel: name of the smoothing kernel.
         smoothing_ratio: smoothing length h over particle spacing.
         sound_speed: numerical speed of sound, m/s.
-        gamma: exponent of the Tait equation (2.25). gamma_ramp: how it grows after an imposition, or None.
+        gamma: exponent of the Tait equation (Grønli 2017, eq. 2.25).
+        gamma_ramp: how gamma grows after an imposition, or None.
         background_pressure: p0 / rho0 in units of c^2 (0: none).
-        hughes_graham: whether p of 2.25 is taken at max(rho, rho0) (Hughes & Graham 2010): a fluid that cannot pull.
-        continuity: "volume" or "mass" (2.19) form of the density rate.
+        hughes_graham: whether the Tait pressure is taken at max(rho, rho0) (Hughes & Graham 2010), which
+            cannot pull.
+        continuity: "volume" or "mass" (Grønli 2017, eq. 2.19) form of the density rate.
         pressure: form of the pressure force (``MomentumTerms``).
-        artificial_viscosity: alpha of 2.29, or None.
+        artificial_viscosity: alpha (Grønli 2017, eq. 2.29), or None.
         laminar_viscosity: whether the viscosity of the scene's fluid acts (Morris et al. 1997).
-        density_diffusion: delta of delta-SPH, or None. diffusion_form: "plain" (Molteni & Colagrossi 2009) or
-            "corrected" (Antuono et al. 2010: leaves a linear density alone, at two more passes a step).
+        density_diffusion: delta of delta-SPH, or None.
+        diffusion_form: "plain" (Molteni & Colagrossi 2009) or "corrected" (Antuono et al. 2010: leaves a linear density
+            alone, at two more passes a step).
         xsph: velocity smoothing, or None.
         shifting: strength of the particle shifting (Lind et al. 2012 with the speed of the particle), or None.
         bulk_damping: coefficient of a pressure -b c h div v that damps sound, or None.
-        shepard_period: steps between filters of the density, or None. density_filter: "shepard" (2.20), or "mls", which
-            leaves a linear density alone (Colagrossi & Landrini 2003 eqs. 12-14).
-        wall: wall model for scenes with walls; valve: valve model for scenes with valves (None: stays shut).
+        shepard_period: steps between filters of the density, or None.
+        density_filter: "shepard" (Grønli 2017, eq. 2.20), or "mls", which leaves a linear density alone (Colagrossi &
+            Landrini 2003, eqs. 12-14).
+        wall: wall model for scenes with walls.
+        valve: valve model for scenes with valves; they stay shut with None.
         shifting_speed: the speed in the shifting: "local" (the particle's own) or "largest" (of its member: also
             stagnation points are evened out, which a vortex needs and a jet in a resting chamber does not).
-        shifting_surface: h times the crowding gradient above which a particle counts as one of a free surface and is
-            not shifted, or None: all are.
+        shifting_surface: h times the concentration gradient above which a particle counts as one of a free surface and
+            is not shifted, or None: all are.
         tensile: R of Monaghan's tensile correction (2000; 0.2 there, symmetric pressure form only), or None.
-        order: "thesis" steps as algorithm 1; "symplectic" evaluates both passes at one position (symplectic Euler);
-            "verlet" is the position Verlet scheme, "predictor_corrector" the symplectic predictor-corrector, both of
-            second order (module ``second_order``).
+        order: "thesis" steps as Grønli 2017, algorithm 1; "symplectic" evaluates both passes at one position
+            (symplectic Euler); "verlet" is the position Verlet scheme, "predictor_corrector" the symplectic
+            predictor-corrector, both of second order (``stepping.time_schemes``).
         courant: fraction of the acoustic limit h / (c + v), of h^2/(8 nu) and of sqrt(h / |a|) / 2.
         constant_volume: the fluid fills a volume that never changes (a periodic box, or walls without openings that
             enclose the same volume all the time): its mean density is held, which wanders by percents otherwise.

@@ -13,8 +13,13 @@ from .particles import Particles
 class Split(Protocol):
     """What openings that are open together carried when it was last read (``valves.flux_split``)."""
 
-    numbers: tuple[int, ...]
-    flux: Tensor
+    @property
+    def numbers(self) -> tuple[int, ...]:
+        """Of the openings."""
+
+    @property
+    def flux(self) -> Tensor:
+        """(members, len(numbers)), internal, inwards."""
 
     def at(self, numbers: tuple[int, ...], areas: Tensor, total: Tensor) -> Tensor:
         """Fluxes (members, n) of some of the openings that sum to ``total`` (members,)."""
@@ -30,6 +35,11 @@ class Clock:
         times: () or (members,) float64, s, the present time of all members or of each.
         flux_split: how openings that are open together share what they pass; None until it is read.
     """
+
+    open_regions: tuple[int, ...]
+    valve_strength: float | Tensor
+    middle: float
+    times: Tensor
 
     def __init__(self, device: str | torch.device) -> None:
         self._device = device

@@ -19,8 +19,10 @@ class Particles:
     """Particles of B members in one flat set (see ``Units`` for the units).
 
     Attributes:
-        position: (N, D). velocity: (N, D).
-        deviation: (N,), (rho - rho0) / rho0. mass: (N,), m / rho0 (a volume at rest density).
+        position: (N, D).
+        velocity: (N, D).
+        deviation: (N,), (rho - rho0) / rho0.
+        mass: (N,), m / rho0 (a volume at rest density).
         member: (N,) int64, 0 <= member < members.
         kind: (N,) int64, FLUID; RESERVOIR + v for a particle of the buffer of opening v, whose velocity is prescribed;
             CHANNEL - v for one that has left through opening v and still moves freely.
@@ -73,7 +75,7 @@ class Particles:
 
     def select(self, keep: Tensor) -> Particles:
         """The particles where ``keep`` (N,) bool, or the indices in ``keep``."""
-        return replace(self, **{name: value[keep] for name, value in self._arrays().items()})
+        return self.changed(**{name: value[keep] for name, value in self._arrays().items()})
 
     def joined(self, other: Particles) -> Particles:
         """These particles followed by those of ``other``; where they lack them these get labels and full confidence."""
@@ -85,15 +87,15 @@ class Particles:
             theirs["confidence"] = torch.ones_like(other.mass)
         if other.pressure is None:
             theirs["pressure"] = torch.zeros_like(other.mass)
-        return replace(self, **{name: torch.cat([value, theirs[name]]) for name, value in self._arrays().items()})
+        return self.changed(**{name: torch.cat([value, theirs[name]]) for name, value in self._arrays().items()})
 
     def repeated(self, members: int) -> Particles:
         """``members`` copies of a single member, one after the other, without labels."""
         if self.members != 1:
             raise ValueError(f"only a single member can be repeated, this set has {self.members}")
         copies = {n: value.repeat((members,) + (1,) * (value.ndim - 1)) for n, value in self._arrays().items()}
-        member = torch.arange(members, device=self.member.device).repeat_interleave(self.count)
-        return Particles(**{**copies, "member": member, "label": None}, members=members)
+        copies["member"] = torch.arange(members, device=self.member.device).repeat_interleave(self.count)
+        return replace(self.changed(**copies), members=members, label=None)
 
     def with_member(self, member: int, other: Particles) -> tuple[Particles, Tensor]:
         """Particles whose ``member`` is as in ``other``, and where they come from: rows (N,) of the two joined.
@@ -117,7 +119,13 @@ class Particles:
         return replace(self, label=torch.arange(self.count, device=self.member.device))
 
     def by_label(self) -> Particles:
-        """In the order of the labels, and without them."""
+        """In the order of the labels, and without them.
+
+        Raises:
+            ValueError: the particles have none.
+        """
+        if self.label is None:
+            raise ValueError("particles without labels cannot be put in their order")
         return replace(self.select(torch.argsort(self.label, stable=True)), label=None)
 
     def _arrays(self) -> dict[str, Tensor]:

@@ -45,19 +45,25 @@ class Record:
     A new account is one line below and one here: it is made, summed, taken back and shown from there.
 
     Attributes:
-        members: number of members. valves: number of valves. device: of the tensors.
+        members: number of members.
+        valves: number of valves.
+        device: of the tensors.
         steps: time steps taken.
         failed: a non-finite state appeared; the member is frozen at its last good state.
-        smallest_density, largest_density: over time and particles, relative to the rest density.
+        smallest_density: over time and particles, relative to the rest density.
+        largest_density: likewise.
         largest_mach: largest |v| / c.
         outside: particles beyond the wall now, in no open valve.
         crossed_wall: how often a particle was found beyond the wall and put back.
-        inserted, removed: particles that entered and left, by valve: (members, valves).
-        inflow, outflow: volume that entered and left, by valve, m^D (in a plane m^2): (members, valves).
+        inserted: particles that entered, by valve: (members, valves).
+        removed: particles that left, by valve.
+        inflow: volume that entered, by valve, m^D: (members, valves).
+        outflow: volume that left, by valve.
         cavity_change: of the cavity's volume since the run began, m^D: what has to enter less what leaves.
-        merged, reseeded: particles that population control merged into others, and that it put into holes.
-        energy_in, energy_out: kinetic energy and work of pressure that entered and left with it, by valve, J (in a
-            plane J/m): (members, valves).
+        merged: particles that population control merged into others.
+        reseeded: particles that it put into holes.
+        energy_in: kinetic energy and work of pressure that entered, by valve, J (in a plane J/m): (members, valves).
+        energy_out: what left of them, by valve.
         wall_work: done on the fluid by moving walls: pressure, friction and stops; J (in a plane J/m).
         source_work: done on the fluid by pressure sources, J (in a plane J/m).
         filling: volume of the particles inside over that of the cavity now; NaN in scenes without walls. Where a closed
@@ -69,7 +75,8 @@ class Record:
         floored: steps that the scheme's floor kept longer than the limits asked for; such a run may be unstable.
         rollbacks: how often the member went back to an earlier state to try again with shorter steps.
         overflows: searches made again because the lists outgrew their room, of all members together.
-        pressure_iterations: of the solver of projections. unconverged: projections that ended without convergence.
+        pressure_iterations: of the solver of projections.
+        unconverged: projections that ended without convergence.
         largest_mismatch: largest mean divergence, internal, that no pressure could answer (a closed cavity whose volume
             changes, or a flux that differs from it); it is spread evenly and so stays with the particles' volume.
     """

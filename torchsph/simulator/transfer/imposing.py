@@ -1,8 +1,8 @@
 """From grids to particles: velocities at points by moving least squares over the nodes around, and beyond a mask.
 
 First order with a compact weight, gathered by the receiving side only, so that linear fields are reproduced exactly
-wherever the neighbourhood is not degenerate (the thesis's symmetric form overshoots; section 5.1 of the thesis asks for
-this cure). The way back is ``pairs.moving_least_squares.fetch_at``.
+wherever the neighbourhood is not degenerate (the symmetric form of Grønli 2017 overshoots; sec. 5.1 there asks for this
+cure). The way back is ``pairs.moving_least_squares.fetch_at``.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from torchsph.pairs.moving_least_squares import first_order_value
 
 _CHUNK = 1 << 15
 # summed weight, relative to full coverage, below which nothing is known
-_LEAST_SHARE = 1e-6
+_LEAST_COVERAGE = 1e-6
 
 
 def wendland_weight(ratio: Tensor) -> Tensor:
@@ -38,14 +38,14 @@ def impose_at(
     Returns:
         value (N, C), and the summed weight (N,) relative to full coverage with weight 1 (0: nothing known there).
     """
-    values, shares = [], []
+    values, coverage = [], []
     for start in range(0, points.shape[0], _CHUNK):
-        some, share = _impose_chunk(points[start : start + _CHUNK], grid, field, weight, reach)
-        values.append(some)
-        shares.append(share)
+        value, weights = _impose_chunk(points[start : start + _CHUNK], grid, field, weight, reach)
+        values.append(value)
+        coverage.append(weights)
     if not values:
         return points.new_zeros((0, field.shape[0])), points.new_zeros(0)
-    return torch.cat(values), torch.cat(shares)
+    return torch.cat(values), torch.cat(coverage)
 
 
 def _impose_chunk(points: Tensor, grid: Grid, field: Tensor, weight: Tensor, reach: float) -> tuple[Tensor, Tensor]:
@@ -93,9 +93,9 @@ def _full_weight(dimension: int, reach: float) -> float:
 
 def pulled(points: Tensor, velocity: Tensor, grid: Grid, target: Tensor, gain: Tensor, weight: Tensor) -> Tensor:
     """Velocity (N, D) pulled towards a grid field where it is known; see ``particle_filter``."""
-    value, share = impose_at(points, grid, torch.cat([target, gain[None]]), weight)
+    value, covered = impose_at(points, grid, torch.cat([target, gain[None]]), weight)
     # at the very end of a node's reach the weights underflow, and their fit is no number
-    known = (share > _LEAST_SHARE)[:, None]
+    known = (covered > _LEAST_COVERAGE)[:, None]
     moved = velocity + value[:, -1:].clamp(0.0, 1.0) * (value[:, :-1] - velocity)
     return torch.where(known, moved, velocity)
 

@@ -24,7 +24,8 @@ class CavityVolume:
         units: internal units.
         wrapped_time: the time (s) among the key frames that a time (s) stands for, by the motion's period.
         with_volume: whether V is asked for, not dV/dt alone.
-        device, dtype: of what is looked up.
+        device: of what is looked up.
+        dtype: of what is looked up.
     """
 
     def __init__(

@@ -32,7 +32,8 @@ class ValveSetting:
         compressible: whether the scheme has an equation of state.
         wrapped_time: the time (s) among the walls' key frames that a time (s) stands for.
         period: (D,), internal, of the periodic box, or None.
-        device, dtype: of the particles.
+        device: of the particles.
+        dtype: of the particles.
     """
 
     scene: Scene

@@ -100,7 +100,9 @@ class Openings:
     """All openings of a scene's valves; a region may consist of several.
 
     Attributes:
-        all: the orifices. valve_of: of each opening, the number of its valve. valves: those of the scene.
+        all: the orifices.
+        valve_of: of each opening, the number of its valve.
+        valves: those of the scene.
         given: numbers of the openings at a given pressure.
     """
 
@@ -153,11 +155,13 @@ class Openings:
 
     def active(self, clock: Clock) -> list[tuple[int, OpeningPlane]]:
         """(number, plane now) of the openings of open valves."""
-        return [(n, self.plane(n, clock.mean)) for n, one in enumerate(self.all) if one.label in clock.open_regions]
+        return [
+            (n, self.plane(n, clock.mean)) for n, orifice in enumerate(self.all) if orifice.label in clock.open_regions
+        ]
 
     def shut(self, clock: Clock) -> list[int]:
         """Numbers of the openings of valves that are shut."""
-        return [n for n, one in enumerate(self.all) if one.label not in clock.open_regions]
+        return [n for n, orifice in enumerate(self.all) if orifice.label not in clock.open_regions]
 
     def valve(self, number: int) -> Valve:
         """The valve of an opening."""

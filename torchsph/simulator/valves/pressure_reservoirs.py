@@ -101,15 +101,15 @@ class PressureReservoirs:
 
         The velocity is the opening's own, and the fluid's along the normal.
         """
-        mine, height = particles.select(row), plane.height(particles.position[row])
+        buffer, height = particles.select(row), plane.height(particles.position[row])
         near = particles.select(particles.inside & (plane.height(particles.position).abs() < _REACH))
 
         def read(values: Tensor, old: Tensor, depth: Tensor) -> Tensor:
-            place = mine.position - (height + depth)[:, None] * plane.normal
+            place = buffer.position - (height + depth)[:, None] * plane.normal
             found = fetch_at(
                 self._backend,
                 place,
-                mine.member,
+                buffer.member,
                 near.position,
                 near.member,
                 values[:, None],
@@ -119,10 +119,10 @@ class PressureReservoirs:
             return torch.where(found.covered, found.value[:, 0], old)
 
         deep = torch.full_like(height, _DEPTH)
-        old = (mine.velocity - plane.velocity) @ plane.normal
-        leaves = _mean(old, mine.member, mine.members).index_select(0, mine.member) > 0
+        old = (buffer.velocity - plane.velocity) @ plane.normal
+        leaves = _mean(old, buffer.member, buffer.members).index_select(0, buffer.member) > 0
         along = read((near.velocity - plane.velocity) @ plane.normal, old, _ENTRY * (~leaves).to(deep.dtype))
-        pressure = read(scheme.pressure(near), scheme.pressure(mine), deep)
+        pressure = read(scheme.pressure(near), scheme.pressure(buffer), deep)
         return plane.velocity + along[:, None] * plane.normal, pressure
 
 

@@ -38,7 +38,8 @@ class Reservoirs(ValveModel):
     """Buffers behind the valves of a scene.
 
     Attributes:
-        openings: of the valves. volume: of the cavity.
+        openings: of the valves.
+        volume: of the cavity.
         relaxation: time, internal, in which what the particles' volume lacks is let in, or None.
     """
 

@@ -47,12 +47,12 @@ class SharedFlux:
         """Read the split off the velocities of the openings' buffers, where a run goes on; nothing without them."""
         free = self._free(clock)
         behind = [(particles.kind == RESERVOIR + n) | (particles.kind == CHANNEL - n) for n, _ in free]
-        if len(free) < 2 or not all(bool(one.any()) for one in behind):
+        if len(free) < 2 or not all(bool(buffer.any()) for buffer in behind):
             return
         read = []
-        for (_, plane), one in zip(free, behind, strict=True):
-            along = torch.where(one, ((particles.velocity - plane.velocity) * plane.normal).sum(1), 0.0)
-            count = particles.per_member(one.to(along.dtype), "sum").clamp_min(1.0)
+        for (_, plane), buffer in zip(free, behind, strict=True):
+            along = torch.where(buffer, ((particles.velocity - plane.velocity) * plane.normal).sum(1), 0.0)
+            count = particles.per_member(buffer.to(along.dtype), "sum").clamp_min(1.0)
             read.append(-plane.area * particles.per_member(along, "sum") / count)
         self._keep(torch.stack(read, 1), free, clock)
 

@@ -1,0 +1,116 @@
+"""A checkpoint comes back bit for bit, or is refused with its name and a cure."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import torchsph
+from geometry import Grid, Recording
+from torchsph import EnsembleOptions
+from torchsph.methods.ensemble.assimilate import _identity
+from torchsph.methods.runtime import checkpoint
+
+STATE = {"x": torch.arange(500.0), "list": [1, 2.5, None, "text"]}
+
+
+@pytest.fixture(name="path")
+def _path(tmp_path: Path) -> Path:
+    path = tmp_path / "run" / "checkpoint.pt"
+    checkpoint.save(path, "key", STATE)
+    return path
+
+
+def test_it_comes_back(path: Path) -> None:
+    back = checkpoint.load(path, "key")
+    assert torch.equal(back["x"], STATE["x"]) and back["list"] == STATE["list"]
+    assert checkpoint.load(path.with_name("none.pt"), "key") is None
+    assert os.listdir(path.parent) == ["checkpoint.pt"]
+
+
+def test_no_flipped_bit_passes(path: Path) -> None:
+    good, draw = path.read_bytes(), np.random.default_rng(0)
+    places = [*range(150), *draw.integers(0, len(good), 300)]
+    for place in places:
+        bad = bytearray(good)
+        bad[place] ^= 1 << int(draw.integers(8))
+        path.write_bytes(bad)
+        for look in (lambda: checkpoint.refuse_damaged(path), lambda: checkpoint.load(path, "key")):
+            with pytest.raises(ValueError, match=r"checkpoint.pt: .*remove it and start anew"):
+                look()
+
+
+def test_what_is_cut_or_none_is_refused(path: Path) -> None:
+    good = path.read_bytes()
+    torch.save([1], path.with_name("other.pt"))
+    others = (path.with_name("other.pt").read_bytes(), b"", b"hello", b"\n\n\n\n", good + b"\0")
+    for content in (*others, *(good[:length] for length in range(0, len(good), 61))):
+        path.write_bytes(content)
+        with pytest.raises(ValueError, match=r"checkpoint.pt: .*remove it and start anew"):
+            checkpoint.load(path, "key")
+    path.unlink()
+    path.mkdir()
+    with pytest.raises(ValueError, match=r"checkpoint.pt: is not a file"):
+        checkpoint.refuse_damaged(path)
+
+
+def test_another_run_s_is_refused(path: Path) -> None:
+    with pytest.raises(ValueError, match=r"checkpoint.pt: belongs to a run with other"):
+        checkpoint.load(path, "other")
+
+
+def test_a_failed_write_leaves_the_last_state(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    for step in ("write", "fsync", "replace"):
+        with monkeypatch.context() as patch:
+            patch.setattr(os, step, fail)
+            with pytest.raises(OSError, match=r"checkpoint.pt"):
+                checkpoint.save(path, "key", {"x": torch.zeros(3)})
+        assert os.listdir(path.parent) == ["checkpoint.pt"]
+        assert torch.equal(checkpoint.load(path, "key")["x"], STATE["x"])
+
+
+def test_a_planted_link_is_neither_followed_nor_replaced(path: Path) -> None:
+    victim = path.with_name("victim")
+    victim.write_text("somebody's")
+    path.with_name("checkpoint.pt.part").symlink_to(victim)
+    checkpoint.save(path, "key", STATE)
+    path.unlink()
+    path.symlink_to(victim)
+    with pytest.raises(FileExistsError, match="symbolic link"):
+        checkpoint.save(path, "key", STATE)
+    assert victim.read_text() == "somebody's"
+
+
+def test_the_fingerprint_tells_every_part_and_version_apart(monkeypatch: pytest.MonkeyPatch) -> None:
+    parts = ([1.0, "a"], [1.0, "b"], [np.zeros(3)], [np.zeros((3, 1))], [np.zeros(3, np.float32)], ["a", "b"], ["ab"])
+    keys = {checkpoint.fingerprint(one) for one in parts}
+    monkeypatch.setattr(torchsph, "__version__", "another")
+    assert len(keys) == len(parts) and not keys & {checkpoint.fingerprint(one) for one in parts}
+
+
+def test_all_that_a_recording_says_enters_the_run_s_identity(box_recording: Callable[..., Recording]) -> None:
+    measured = box_recording(lambda points, t: 0.1 * np.cos(100 * points + t), nodes=4)
+    grid, options = measured.grid, EnsembleOptions()
+    model = torchsph.make_model(measured, spacing=3e-3)
+
+    def key(recording: Recording) -> str:
+        return checkpoint.fingerprint(_identity([recording], model, model, None, options, 3, 0))
+
+    others = (
+        {"grid": Grid(tuple(x + 1e-3 for x in grid.origin), grid.spacing, grid.shape)},
+        {"grid": Grid(grid.origin, tuple(1.05 * x for x in grid.spacing), grid.shape)},
+        {"rho": 500.0},
+        {"mu": 0.04},
+        {"period": 0.02},
+    )
+    keys = {key(measured), *(key(replace(measured, **change)) for change in others)}
+    assert len(keys) == 1 + len(others) and key(replace(measured)) in keys
