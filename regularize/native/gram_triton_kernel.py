@@ -7,9 +7,7 @@ import triton.language as tl
 
 
 @triton.jit
-def add_grams(  # type: ignore[no-untyped-def]  # a kernel, whose arguments are pointers and numbers of triton
-    values, start, unknown, band, width, size, columns: tl.constexpr, tile: tl.constexpr
-):
+def add_grams(values, start, unknown, band, width, size, columns: tl.constexpr, tile: tl.constexpr):
     """Add each cell's sum of row products to the lower band.
 
     ``values`` (rows, size) sorted by cell, ``start`` (cells + 1), ``unknown`` (cells, size) solve numbers
