@@ -88,7 +88,7 @@ class Components:
 
     @property
     def parts(self) -> int:
-        """Numbers measured at each place."""
+        """Number of components at a node."""
         return len(self.directions)
 
     def of(self, vectors: Tensor) -> Tensor:
@@ -136,7 +136,7 @@ class FullVectors(MeasurementType):
 
     @property
     def parts(self) -> int:
-        """D: all components are measured."""
+        """Number of components at a node: the dimension."""
         return self.dimension
 
     def directions(self, frame: int) -> np.ndarray:
@@ -144,15 +144,15 @@ class FullVectors(MeasurementType):
         return np.eye(self.dimension).reshape(self.dimension, self.dimension, *[1] * self.dimension)
 
     def components(self, velocity: np.ndarray) -> np.ndarray:
-        """The velocity itself: nothing of it is missing."""
+        """What is seen of vectors: all of them."""
         return velocity
 
     def projected(self, velocity: np.ndarray) -> np.ndarray:
-        """The velocity itself: nothing of it is lost."""
+        """Vectors as they would be measured: unchanged."""
         return velocity
 
     def at(self, frame: int, node: Tensor) -> Components:
-        """The axes as directions at nodes (q,), flat indices, whatever the frame."""
+        """Components of a frame at some nodes: the vectors themselves."""
         axes = torch.eye(self.dimension, dtype=torch.float64)
         return Components(axes[:, None].expand(-1, len(node), -1), True)
 
@@ -173,16 +173,14 @@ class AlongBeam(MeasurementType):
 
     @classmethod
     def of(cls, recording: Recording) -> AlongBeam | None:
-        """Of a recording that gives its beam; None for others."""
+        """The type of a recording that holds one component along a beam."""
         return None if recording.beam is None else cls(recording.beam, recording.dimension)
 
     @property
     def parts(self) -> int:
-        """1: the component along the beam."""
         return 1
 
     def directions(self, frame: int) -> np.ndarray:
-        """(1, D, *shape) unit vectors of the beam at a frame."""
         return (self.beam[frame] if self.moving else self.beam)[None]
 
 

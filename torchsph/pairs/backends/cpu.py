@@ -79,7 +79,7 @@ class CpuBackend(PlannedBackend[ClusterPairs]):
         margin: float = 0.0,
         period: Tensor | None = None,
     ) -> ClusterPairs:
-        """Pairs within the radius and its margin, by clusters of particles; see `Backend.search`."""
+        """See ``Backend.search``."""
         self.check(position)
         check_particles(position, member)
         check_period(period, position.shape[1])
@@ -101,7 +101,7 @@ class CpuBackend(PlannedBackend[ClusterPairs]):
         return pairs
 
     def order(self, pairs: ClusterPairs) -> Tensor:
-        """(N,) particles in the order of their clusters."""
+        """See ``Backend.order``."""
         return pairs.order
 
     @staticmethod
@@ -154,7 +154,7 @@ class CpuBackend(PlannedBackend[ClusterPairs]):
         iterations: int,
         group: Tensor | None = None,
     ) -> PoissonSolution:
-        """The compiled solution of the pressure's equation; see `Backend.poisson`."""
+        """See ``Backend.poisson``."""
         self.check(state.position, source, *(() if start is None else (start,)))
         self._check_state(pairs, state)
         self._check_field(state, source, active)
@@ -197,7 +197,7 @@ class CpuBackend(PlannedBackend[ClusterPairs]):
         period: Tensor | None = None,
         weight: Tensor | None = None,
     ) -> Moments:
-        """Compiled sums over the particles around each query; see `Backend.interpolate`."""
+        """See ``Backend.interpolate``."""
         self.check(position, fields, query, *(() if weight is None else (weight,)))
         check_particles(position, member)
         check_particles(query, query_member, ("query", "query_member"))

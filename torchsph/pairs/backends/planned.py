@@ -62,11 +62,11 @@ class PlannedBackend(Backend[Planned]):
         return True
 
     def rates(self, pairs: Planned, state: PairState, support: Support, terms: RateTerms) -> Rates:
-        """The rates in as few passes over the pairs as `plan` finds."""
+        """See ``Backend.rates``."""
         return Rates(**self._sums(pairs, state, support, plan.rate_passes(terms)))
 
     def momentum(self, pairs: Planned, state: PairState, support: Support, terms: MomentumTerms) -> Tensor:
-        """(N, D) accelerations in one pass, m/s^2; zeros where no term is asked for."""
+        """See ``Backend.momentum``."""
         request = plan.force_pass(terms)
         if request is None:
             return torch.zeros_like(state.position)
@@ -75,7 +75,6 @@ class PlannedBackend(Backend[Planned]):
     def right_hand_side(
         self, pairs: Planned, state: PairState, support: Support, rates: RateTerms, momentum: MomentumTerms
     ) -> tuple[Rates, Tensor]:
-        """Rates and accelerations, in passes that they share where that is faster."""
         shared = plan.shared_passes(rates, momentum) if self._shares_loops(state.position.dtype) else None
         if shared is None:
             return super().right_hand_side(pairs, state, support, rates, momentum)
@@ -86,7 +85,6 @@ class PlannedBackend(Backend[Planned]):
     def laplacian(
         self, pairs: Planned, state: PairState, support: Support, field: Tensor, active: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
-        """The operator's sum and its diagonal in one pass; see `Backend.laplacian`."""
         self._check_state(pairs, state)
         self._check_field(state, field, active)
         request = plan.Pass(plan.LAPLACIAN, plan.BY_VOLUME)

@@ -33,10 +33,10 @@ class CellRuns:
 
     Attributes:
         order: (N,) int64, cell order -> particle.
-        member: (N,) int32 in cell order.
-        start: (R, N) int32 in cell order, of each run its first; R = 3^(D-1) rows of three cells, or 3^D cells
-            where the first axis is periodic.
-        stop: (R, N) int32, of each run the one after its last.
+        member: (N,) int32, in cell order.
+        start: (R, N) int32, in cell order; R = 3^(D-1) rows of three cells, or 3^D cells where the first axis is
+            periodic.
+        stop: (R, N) int32, likewise.
         period: (D,) floats, inf where an axis is not periodic.
         members: how many members there are.
     """
@@ -105,7 +105,6 @@ class CudaBackend(PlannedBackend[CellRuns]):
         margin: float = 0.0,
         period: Tensor | None = None,
     ) -> CellRuns:
-        """Runs of particles in the cells around each particle; no list of pairs is stored."""
         self.check(position)
         check_particles(position, member)
         check_period(period, position.shape[1])
@@ -125,7 +124,6 @@ class CudaBackend(PlannedBackend[CellRuns]):
         weight: Tensor | None = None,
     ) -> Moments:
         # once per recorded frame: the reference's torch on this device is fast enough
-        """Sums over the particles around each query, by the reference on this device; see `Backend.interpolate`."""
         return ReferenceBackend().interpolate(
             position, member, fields, support, query, query_member, period=period, weight=weight
         )
