@@ -178,9 +178,11 @@ class AlongBeam(MeasurementType):
 
     @property
     def parts(self) -> int:
+        """1: the component along the beam."""
         return 1
 
     def directions(self, frame: int) -> np.ndarray:
+        """(1, D, *shape) unit vectors of the beam at a frame."""
         return (self.beam[frame] if self.moving else self.beam)[None]
 
 
