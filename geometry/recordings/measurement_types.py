@@ -178,11 +178,11 @@ class AlongBeam(MeasurementType):
 
     @property
     def parts(self) -> int:
-        """1: the component along the beam."""
+        """Number of components at a node: one."""
         return 1
 
     def directions(self, frame: int) -> np.ndarray:
-        """(1, D, *shape) unit vectors of the beam at a frame."""
+        """(1, D, *shape) unit vectors along the beam."""
         return (self.beam[frame] if self.moving else self.beam)[None]
 
 

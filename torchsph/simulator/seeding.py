@@ -34,7 +34,8 @@ class Seeding:
     """How particles are placed.
 
     Attributes:
-        kind: "boltzmann": random positions accepted with exp(-(U - U0) / T) (Grønli 2017, sec. 3.1.4, corrected);
+        kind: "boltzmann": random positions accepted with exp(-(U - U0) / T) (Grønli 2017, sec. 3.1.4, with
+            its erratum);
             "quiet": a lattice cut by the walls, then relaxed until the concentration gradient is small.
         temperature: T in units of the wall potential at d = 0 (boltzmann).
         relaxations: sweeps of the quiet start that move particles down the gradient of their concentration.

@@ -75,7 +75,7 @@ class PlannedBackend(Backend[Planned]):
     def right_hand_side(
         self, pairs: Planned, state: PairState, support: Support, rates: RateTerms, momentum: MomentumTerms
     ) -> tuple[Rates, Tensor]:
-        """Rates and accelerations, in passes that they share where that is faster."""
+        """See ``Backend.right_hand_side``."""
         shared = plan.shared_passes(rates, momentum) if self._shares_loops(state.position.dtype) else None
         if shared is None:
             return super().right_hand_side(pairs, state, support, rates, momentum)
@@ -86,7 +86,7 @@ class PlannedBackend(Backend[Planned]):
     def laplacian(
         self, pairs: Planned, state: PairState, support: Support, field: Tensor, active: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
-        """The operator's sum and its diagonal in one pass; see ``Backend.laplacian``."""
+        """See ``Backend.laplacian``."""
         self._check_state(pairs, state)
         self._check_field(state, field, active)
         request = plan.Pass(plan.LAPLACIAN, plan.BY_VOLUME)

@@ -44,13 +44,13 @@ class ReferenceBackend(Backend[PairList]):
         margin: float = 0.0,
         period: Tensor | None = None,
     ) -> PairList:
-        """Every pair within the radius and its margin, once."""
+        """See ``Backend.search``."""
         check_search(position, radius + margin, period)
         first, second = half_pairs(position.detach(), member, radius + margin, period)
         return PairList(first, second, period)
 
     def rates(self, pairs: PairList, state: PairState, support: Support, terms: RateTerms) -> Rates:
-        """The rates, term after term as ``RateTerms`` names them."""
+        """See ``Backend.rates``."""
         geometry = _Geometry(pairs, state, support)
         volume = state.volume
         va, vb = geometry.ends(volume)
@@ -87,7 +87,7 @@ class ReferenceBackend(Backend[PairList]):
         return Rates(**out)
 
     def momentum(self, pairs: PairList, state: PairState, support: Support, terms: MomentumTerms) -> Tensor:
-        """(N, D) accelerations, term after term as ``MomentumTerms`` names them, m/s^2."""
+        """See ``Backend.momentum``."""
         geometry = _Geometry(pairs, state, support)
         ma, mb = geometry.ends(state.mass)
         da, db = geometry.ends(state.deviation)
@@ -111,7 +111,7 @@ class ReferenceBackend(Backend[PairList]):
     def laplacian(
         self, pairs: PairList, state: PairState, support: Support, field: Tensor, active: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
-        """The operator's sum and its diagonal; see ``Backend.laplacian``."""
+        """See ``Backend.laplacian``."""
         geometry = _Geometry(pairs, state, support)
         va, vb = geometry.ends(state.volume)
         weight = -2.0 * geometry.factor * geometry.square * geometry.inverse_square
@@ -133,7 +133,7 @@ class ReferenceBackend(Backend[PairList]):
         period: Tensor | None = None,
         weight: Tensor | None = None,
     ) -> Moments:
-        """Sums over the particles around each query; see ``Backend.interpolate``."""
+        """See ``Backend.interpolate``."""
         check_search(torch.cat((position, query)), support.radius, period)
         row, particle = cross_pairs(query, query_member, position, member, support.radius, period)
         offset = nearest_image(position.index_select(0, particle) - query.index_select(0, row), period)

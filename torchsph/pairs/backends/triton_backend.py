@@ -105,7 +105,7 @@ class CudaBackend(PlannedBackend[CellRuns]):
         margin: float = 0.0,
         period: Tensor | None = None,
     ) -> CellRuns:
-        """Runs of particles in the cells around each particle; no list of pairs is stored."""
+        """See ``Backend.search``."""
         self.check(position)
         check_particles(position, member)
         check_period(period, position.shape[1])
@@ -125,7 +125,7 @@ class CudaBackend(PlannedBackend[CellRuns]):
         weight: Tensor | None = None,
     ) -> Moments:
         # once per recorded frame: the reference's torch on this device is fast enough
-        """Sums over the particles around each query, by the reference on this device."""
+        """See ``Backend.interpolate``."""
         return ReferenceBackend().interpolate(
             position, member, fields, support, query, query_member, period=period, weight=weight
         )

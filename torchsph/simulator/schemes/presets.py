@@ -12,8 +12,8 @@ from .valve_models import PressureSource
 from .wall_models import PotentialWall
 from .weakly_compressible import WeaklyCompressible
 
-# 16 particles per cell (Grønli 2017, table 4.1) put a spacing at cell / 16^(1/3); the support of the truncated
-# Gaussian (delta 3) is one cell, so h = cell / 3
+# 16 particles per cell (Grønli 2017, table 4.1) put a spacing at cell / 16^(1/3); the support of the truncated Gaussian
+# (delta 3) is one cell, so h = cell / 3
 _THESIS_RATIO = 16 ** (1 / 3) / 3
 
 # Incompressible steps, for flow that fills a heart's chamber. Error over persistence's on a ventricle at 1 mm, 5 / 10 /
