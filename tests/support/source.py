@@ -66,12 +66,16 @@ class Module:
                 yield from ((module, alias.name) for alias in node.names)
 
     def definitions(self) -> Iterator[tuple[str, Definition]]:
-        """Functions, classes and methods with their dotted names, without what is defined inside functions."""
+        """Functions, classes and methods with their dotted names.
+
+        Left out are what is defined inside functions, and the signatures of an overload, whose implementation speaks
+        for them.
+        """
         todo: list[tuple[str, ast.AST]] = [("", self.tree)]
         while todo:
             prefix, parent = todo.pop(0)
             for node in ast.iter_child_nodes(parent):
-                if isinstance(node, Definition):
+                if isinstance(node, Definition) and not any(_is_overload(mark) for mark in node.decorator_list):
                     yield prefix + node.name, node
                 if isinstance(node, ast.ClassDef):
                     todo.append((f"{prefix}{node.name}.", node))
@@ -146,6 +150,10 @@ class Imports:
         reach = {name: _reachable(plain, name) for name in plain if not self.files[name].is_package}
         found = {frozenset(b for b in reach[a] if a in reach.get(b, ())) for a in reach if a in reach[a]}
         return sorted(map(sorted, found))
+
+
+def _is_overload(decorator: ast.expr) -> bool:
+    return ast.unparse(decorator) in ("overload", "typing.overload")
 
 
 def _reachable(edges: dict[str, set[str]], start: str) -> set[str]:
