@@ -124,6 +124,7 @@ class PackedSystem:
     def __init__(self, system: System, ordering: Ordering) -> None:
         self.system, self.ordering, self.lib = system, ordering, _loaded()
         self._keep: list[object] = []
+        self.slabs = ordering.slabs().contiguous()
         knots, tile = ordering.knots, self.lib.spline_tile_width()
         place = [ordering.axes.index(k) for k in range(system.components)]
         self.grid = _Grid(
@@ -158,14 +159,13 @@ class PackedSystem:
     def band(self) -> torch.Tensor:
         """As :func:`regularize.assembly.reference_band`."""
         band = empty_band(self.system, self.ordering)
-        slabs = self.ordering.slabs().contiguous()
         blocks = (_Rows * len(self.rows))(*self.rows)
         self.lib.spline_gram(
             ctypes.byref(self.grid),
             blocks,
             ctypes.c_int32(len(self.rows)),
-            _address(slabs),
-            ctypes.c_int64(len(slabs) - 1),
+            _address(self.slabs),
+            ctypes.c_int64(len(self.slabs) - 1),
             _address(band),
             ctypes.c_int64(band.shape[1]),
         )
@@ -185,7 +185,8 @@ class PackedSystem:
             target = None if isinstance(block, DivergenceRows) else block.target.double().contiguous()
             if x is not None or target is not None:
                 given = (_address(each) for each in (target, index, x, out))
-                self.lib.spline_gradient(ctypes.byref(self.grid), ctypes.byref(rows), *given)
+                slabs = _address(self.slabs), ctypes.c_int64(len(self.slabs) - 1)
+                self.lib.spline_gradient(ctypes.byref(self.grid), ctypes.byref(rows), *slabs, *given)
         return out if x is None else out - self.system.damping**2 * x
 
     def _subtract_cells(self, block: CellRows, slots: torch.Tensor, x: torch.Tensor, out: torch.Tensor) -> None:

@@ -347,27 +347,30 @@ void spline_gram(const SplineGrid* grid, const SplineRows* blocks, int32_t block
 }
 
 // out (nodes, C) += rows' (target - rows x), the rows of one block. target in the caller's order, of which number[n] is
-// row n's place; null: zero. x (nodes, C); null: zero.
-void spline_gradient(const SplineGrid* grid, const SplineRows* rows, const double* target, const int64_t* number,
-                     const double* x, double* out) {
+// row n's place; null: zero. x (nodes, C); null: zero. Slabs as in spline_gram: they take turns, so that every
+// coefficient's sum has one order, whatever the number of threads and whichever comes first.
+void spline_gradient(const SplineGrid* grid, const SplineRows* rows, const int64_t* slab_start, int64_t slabs,
+                     const double* target, const int64_t* number, const double* x, double* out) {
   const SplineGrid& g = *grid;
   const int local = local_size(g);
   const size_t size = size_t(local) * g.components;
   const PullCell pull = pull_cell_for(g);
+  for (int parity = 0; parity < 2; ++parity) {
 #pragma omp parallel if (rows->count > kWorthThreads)
-  {
-    std::vector<double> row(size), near(size), pulled(size), mine(size_t(g.nodes) * g.components);
-#pragma omp for schedule(static)
-    for (int64_t cell = 0; cell < g.cells; ++cell) {
-      if (rows->start[cell] == rows->start[cell + 1]) continue;
-      const int32_t* position = g.position + cell * local;
-      if (x) gather(g, position, local, x, near.data());
-      std::fill(pulled.begin(), pulled.end(), 0.0);
-      pull(g, *rows, cell, target, number, x ? near.data() : nullptr, row.data(), pulled.data());
-      scatter_add(g, position, local, pulled.data(), mine.data());
+    {
+      std::vector<double> row(size), near(size), pulled(size);
+#pragma omp for schedule(dynamic, 1)
+      for (int64_t slab = parity; slab < slabs; slab += 2) {
+        for (int64_t cell = slab_start[slab]; cell < slab_start[slab + 1]; ++cell) {
+          if (rows->start[cell] == rows->start[cell + 1]) continue;
+          const int32_t* position = g.position + cell * local;
+          if (x) gather(g, position, local, x, near.data());
+          std::fill(pulled.begin(), pulled.end(), 0.0);
+          pull(g, *rows, cell, target, number, x ? near.data() : nullptr, row.data(), pulled.data());
+          scatter_add(g, position, local, pulled.data(), out);
+        }
+      }
     }
-#pragma omp critical
-    for (size_t i = 0; i < mine.size(); ++i) out[i] += mine[i];
   }
 }
 
