@@ -16,6 +16,7 @@ import geometry
 from torchsph.evaluation.frames import frame_at
 from torchsph.simulator.grid_forecast import GridForecast, Transfer
 from torchsph.simulator.simulator import Simulator
+from torchsph.simulator.transfer.checks import check_grid
 
 
 @dataclass(frozen=True)
@@ -76,8 +77,12 @@ def skill(
     A recording with ``weight`` is noisy: ``transfer`` then defaults to the plain fetch.
 
     Raises:
-        ValueError: no frame lies a lead after a start.
+        ValueError: no frame lies a lead after a start, a lead is negative or no number, or the model's scene is of
+            another dimension than the recording.
     """
+    check_grid(recording.grid, model.scene.dimension)
+    if every < 1 or not all(lead >= 0 for lead in leads):
+        raise ValueError(f"leads must not be negative (s), and every at least 1, got {list(leads)} and {every}")
     if transfer is None:
         transfer = Transfer() if recording.weight is None else Transfer(fade=None)
     targets = _targets(recording, leads, every)

@@ -17,6 +17,7 @@ import regularize
 from regularize.solvers.factor import Factor
 
 from ..runtime.parallel import shared
+from .informative import refuse_silent
 from .wall_rows import at_knots, wall_rows
 
 # noise and smoothness are chosen in every third frame and serve its neighbours: flow and noise change over tens of
@@ -52,6 +53,7 @@ class FrameSmoother:
     ) -> None:
         if choose_every < 1:
             raise ValueError(f"choose_every must be at least 1, got {choose_every}")
+        refuse_silent(recording)
         self.estimates = geometry.estimated(recording) if estimates is None else estimates
         recording = self.estimates.recording
         self.type = geometry.measurement_type(recording)
