@@ -29,8 +29,11 @@ from regularize.rows.ordering import Ordering
 
 from . import build, loader
 from .checks import check_array, check_band, check_sizes, check_slots
+from .faults import raise_faults
 
 FAMILY = loader.Family(build.LIBRARIES, build.STEM, "spline_runs", "regularize.native.build")
+GUARDED = ("gram", "gradient", "sort", "factor_f64", "factor_f32", "solve_f64", "solve_f32")
+CURE = "use wider knots, or fewer frames at once"
 KINDS = {VectorRows: 0, DirectionRows: 1, DivergenceRows: 2}
 
 
@@ -71,9 +74,14 @@ def library() -> ctypes.CDLL | None:
     """
     if not FAMILY.path("baseline").is_file():
         return None
-    handle = loader.choose(FAMILY).handle
+    found = loader.choose(FAMILY)
+    handle = found.handle
     for name in ("gram", "gradient", "sort", "set_threads", "solve_f64", "solve_f32"):
         getattr(handle, f"spline_{name}").restype = None
+    try:
+        raise_faults(handle, "spline_fault", {f"spline_{name}": CURE for name in GUARDED})
+    except AttributeError as fault:
+        raise loader.LibraryMissing(loader.outdated(FAMILY, found.instruction_set)) from fault
     return handle
 
 

@@ -50,7 +50,7 @@ REFUSED: dict[str, tuple[Callable[[], object], str]] = {
     "cells": (lambda: system(CellRows(KNOTS, CELLS, ONES.new_ones(2, 64), 3)), "cells .99, 99, 99. to"),
     "factor of cells": (lambda: CellRows(KNOTS, CELLS, ONES, 3), r"it must be \(rows, 64\)"),
     "knots": (lambda: Knots((math.nan,) * 3, (0.005,) * 3, (2, 2, 2)), "all finite"),
-    "many knots": (lambda: Knots((0.0,) * 3, (1e-9,) * 3, (10**4,) * 3), "more than an int32"),
+    "many knots": (lambda: Knots((0.0,) * 3, (1e-9,) * 3, (10**4,) * 3), "more than int32"),
     "short band": (lambda: Factor(BAND[:5].clone(), ORDERING), "a row for each component of the"),
     "narrow band": (lambda: Factor(BAND[:, :5].clone(), ORDERING), "the band is 5 wide, but its columns reach"),
     "whole band": (lambda: Factor(BAND.long(), ORDERING), "the band is of torch.int64"),
