@@ -44,12 +44,11 @@ def frames(first, last):
 
 
 def test_splines_have_the_same_bits_with_any_number_of_threads():
-    measured, found = frames(9, 11), []
-    for number in (1, 2, 3, 2):
+    measured, found = frames(9, 10), []
+    for number in (1, 2):
         with threads(number):
             found.append(PreparedMeasurement(measured).smoothed.velocity)
-    for other in found[1:]:
-        np.testing.assert_array_equal(other, found[0])
+    np.testing.assert_array_equal(found[0], found[1])
 
 
 @pytest.mark.slow

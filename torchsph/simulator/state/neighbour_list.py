@@ -102,7 +102,7 @@ def same_rows(before: Particles, after: Particles) -> tuple[Tensor, Tensor]:
 
 
 def rows_carried(before: Particles, after: Particles, values: Tensor) -> Tensor:
-    """Values (N, D) of ``before`` in the rows of ``after``; zeros for members whose particles are not where they were."""
+    """Values (N, D) of ``before`` in the rows of ``after``; zeros in members whose particles are not the same."""
     if before is after or before.position is after.position:
         return values
     old, new = same_rows(before, after)
