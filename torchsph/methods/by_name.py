@@ -44,10 +44,24 @@ class MethodResult:
 
 
 def make_model(
-    recording: geometry.Recording, *, preset: str = "default", spacing: float | None = None, device: str = "cpu"
+    recording: geometry.Recording,
+    *,
+    preset: str = "default",
+    spacing: float | None = None,
+    device: str = "cpu",
+    estimates: geometry.Estimates | None = None,
 ) -> Simulator:
-    """A simulator of the recording's walls and valves; ``spacing`` (m) defaults to the grid's."""
-    return Simulator(Scene.from_recording(recording, spacing), scheme_preset(preset), device=device)
+    """A simulator of the recording's walls and valves.
+
+    Args:
+        recording: whose walls, valves and fluid they are.
+        preset: name of the scheme.
+        spacing: of the particles, m; None: the grid's.
+        device: where particles live.
+        estimates: what ``geometry.estimated`` found of the recording, where that is known already.
+    """
+    scene = Scene.from_recording(recording, spacing, estimates=estimates)
+    return Simulator(scene, scheme_preset(preset), device=device)
 
 
 def make_smoother(preset: str) -> regularize.Smoother:
@@ -91,13 +105,14 @@ def run_methods(
     smoother, timer = make_smoother(preset), _Timer()
     prepared = PreparedMeasurement(measured, smoother, progress=progress)
     smoothed = prepared.smoothed  # by all processes together
-    found = prepared.splines.estimates.summary()
+    estimates = prepared.splines.estimates
+    found = estimates.summary()
     mended = {"estimates": found} if found else {}
     results: dict[str, MethodResult] = {}
     if "spline" in methods:
         results["spline"] = timer.result(smoothed, {"smoother": repr(smoother), **mended})
     spacing = ANALYSIS_SPACING * min(measured.grid.spacing) if spacing is None else spacing
-    model = make_model(measured, preset=preset, spacing=spacing, device=device)
+    model = make_model(measured, preset=preset, spacing=spacing, device=device, estimates=estimates)
     if is_last() and set(methods) != {"spline"}:
         results["free"] = timer.result(run_freely(measured, model, smoothed.velocity[0], seed=seed, progress=progress))
     if is_lead() and "sph" in methods:
@@ -106,7 +121,7 @@ def run_methods(
     if "ensemble" in methods:
         ensemble = assimilate(
             prepared,
-            make_model(measured, preset=preset, spacing=CONTROL_SHARE * spacing, device=device),
+            make_model(measured, preset=preset, spacing=CONTROL_SHARE * spacing, device=device, estimates=estimates),
             coarse=model,
             members=DEFAULT_MEMBERS if members is None else members,
             options=EnsembleOptions(lag=lag),
