@@ -86,7 +86,7 @@ def test_a_restart_in_the_middle_changes_no_bit(given, plain, tmp_path, monkeypa
     with pytest.raises(Stopped):
         given.run(checkpoints=path)
     monkeypatch.setattr(Cycle, "step", step)
-    with pytest.raises(ValueError, match="belongs to a run with other"):
+    with pytest.raises(ValueError, match="belongs to a run with another seed"):
         given.run(checkpoints=path, resume=True, seed=2)
     assert_same(given.run(checkpoints=path, resume=True), plain)
     assert [shock["time"] for shock in plain.info["shocks"]] == given.measured.time[:-1].tolist()
