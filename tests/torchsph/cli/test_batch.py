@@ -91,16 +91,15 @@ def test_a_failed_item_costs_itself_alone_and_a_done_one_is_not_done_again(recor
     assert list(account["inputs"]["measurement"]) == [str(recordings / "a.h5")]
     assert geometry.read_provenance(recordings / "a.h5") is None
 
-    (root / "gone").mkdir(exist_ok=True)
-    (root / "gone" / "log.txt").touch()
     assert main(["collect", str(root), "--out", str(tmp_path / "table.csv")]) == 0
-    assert "without results: b/a, gone" in capsys.readouterr().err
+    assert "without results: b/a, damaged, gone" in capsys.readouterr().err
     with (tmp_path / "table.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert [(row["item"], row["method"], row["state"]) for row in rows] == [
         ("a", "raw", "done"),
         ("a", "spline", "done"),
         ("b/a", "", "unfinished"),
+        ("damaged", "", "unfinished"),
         ("gone", "", "unfinished"),
     ]
     spline = document["methods"]["spline"]

@@ -30,7 +30,8 @@ def collect(args: argparse.Namespace) -> None:
     path, root = output_file(args.out), Path(args.root)
     if not root.is_dir():
         raise ValueError(f"{root}: is no folder; name the ROOT of torchsph batch")
-    folders = sorted({file.parent for name in ("metrics.json", "log.txt") for file in root.rglob(name)})
+    begun = {file.parent for name in ("metrics.json", "log.txt") for file in root.rglob(name)}
+    folders = sorted(begun | {root / name for name in _listed(root)})
     if not folders:
         raise ValueError(f"{root}: no metrics.json below it; run torchsph batch first")
     rows = [row for folder in folders for row in _rows(folder, folder.relative_to(root).as_posix())]
@@ -62,6 +63,15 @@ def _rows(folder: Path, item: str) -> list[dict[str, Any]]:
     except (ValueError, KeyError, TypeError, AttributeError):
         return [{"item": item, "state": "damaged"}]
     return rows
+
+
+def _listed(root: Path) -> list[str]:
+    """The items that the last ``torchsph batch`` of all of them has gone through."""
+    try:
+        items = json.loads((root / "summary.json").read_text(encoding="utf-8"))["items"]
+        return [str(item["item"]) for item in items]
+    except (OSError, ValueError, KeyError, TypeError):
+        return []
 
 
 def _few(names: Sequence[str]) -> str:
