@@ -8,6 +8,7 @@ import numpy as np
 import torch
 
 import geometry
+from geometry.recordings.whole_file import refuse_special
 
 
 def full_vectors(recording: geometry.Recording, path: str | Path) -> geometry.Recording:
@@ -51,4 +52,5 @@ def output_file(name: str) -> Path:
         raise ValueError(f"--out {path}: is a folder; name a file")
     if not path.parent.is_dir():
         raise ValueError(f"--out {path}: the folder {path.parent} does not exist")
+    refuse_special(path)
     return path
