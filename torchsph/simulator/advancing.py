@@ -109,7 +109,8 @@ class AdvancingRun:
         longest = (until - self.time) / (scheme.steps_per_frame or 1)
         if scheme.max_step is not None:
             longest = min(longest, scheme.max_step)
-        return longest / self.units.time
+        longest /= self.units.time
+        return longest if scheme.longest_step is None else min(longest, scheme.longest_step)
 
     def _advance_interval(self, stop: float, longest: float) -> None:
         duration = (stop - self.time) / self.units.time

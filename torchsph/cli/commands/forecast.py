@@ -68,12 +68,17 @@ def forecast(args: argparse.Namespace) -> None:
             geometry.write_recording(scratch / f"forecast_{1e3 * lead:g}ms.h5", saved, provenance=account)
         figures.draw_forecast(scratch / "forecast.png", skill.leads)
         (scratch / "config.toml").write_text(config_text(args), encoding="utf-8", errors="backslashreplace")
-        write_json(scratch / "metrics.json", {"leads": skill.leads, "seconds": skill.seconds, "config": config})
+        found = {"leads": skill.leads, "seconds": skill.seconds, "config": config, "failures": skill.failures}
+        write_json(scratch / "metrics.json", found)
     rows = [["lead ms", "starts", "model", "persistence"]]
     for row in skill.leads:
         errors = [f"{row['nrmse'][name]:.3f}" for name in ("model", "persistence")]
         rows.append([f"{1e3 * row['lead']:g}", str(row["starts"]), *errors])
     print_table(rows)
+    for failed in skill.failures:
+        say(f"no forecast from frame {failed['frame']} ({failed['time']:g} s): {failed['reason']}")
+    if skill.failures:
+        say(f"{len(skill.failures)} of the starts failed; the errors above are of the others")
     say(f"wrote forecast.png, metrics.json{' and the forecasts' if args.save else ''} to {folder}/")
 
 
