@@ -13,7 +13,7 @@ from .recordings.checks import findings
 from .recordings.errors import RecordingError
 from .recordings.finding import Finding
 from .recordings.measurement_types import MeasurementType, measurement_type
-from .recordings.read import read_recording
+from .recordings.read import read_provenance, read_recording
 from .recordings.recording import Recording, Wall
 from .recordings.rules import check_recording
 from .recordings.write import write_recording
@@ -70,6 +70,7 @@ __all__ = [
     "openings",
     "orifices",
     "polygon",
+    "read_provenance",
     "read_recording",
     "read_surface",
     "refined",

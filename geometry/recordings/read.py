@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -63,6 +64,27 @@ def read_recording(path: str | Path) -> Recording:
     refuse_implausible(recording, source)
     recording.velocity[~np.broadcast_to(recording.mask[:, None], recording.velocity.shape)] = 0
     return recording
+
+
+def read_provenance(path: str | Path) -> dict[str, Any] | None:
+    """What a file's attribute `provenance` says of its making; None where there is none, or it cannot be understood.
+
+    Raises:
+        FileNotFoundError: there is no file.
+        RecordingError: it is no HDF5 file.
+    """
+    source = str(path)
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"{path}: there is no such file")
+    with reading(source, "file", "is not a readable HDF5 file"):
+        file = h5py.File(path, "r")
+    with file:
+        text = _text(file, "provenance", source)
+    try:
+        found = json.loads(text)
+    except ValueError:
+        return None
+    return found if isinstance(found, dict) else None
 
 
 def _read(file: h5py.File, source: str, size: int) -> Recording:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 import geometry
+from geometry.recordings.whole_file import refuse_special
 from torchsph.methods.measurement.informative import refuse_exact, refuse_silent
 from torchsph.simulator.state.checks import usable_device as known_device
 
@@ -55,4 +56,5 @@ def output_file(name: str) -> Path:
         raise ValueError(f"--out {path}: is a folder; name a file")
     if not path.parent.is_dir():
         raise ValueError(f"--out {path}: the folder {path.parent} does not exist")
+    refuse_special(path)
     return path

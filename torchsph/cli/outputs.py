@@ -8,7 +8,7 @@ import math
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -22,10 +22,18 @@ __all__ = ["output_folder", "staged", "write_json"]
 _SCRATCH = ".torchsph-"
 
 
-def output_folder(path: str | Path) -> Path:
-    """`path` as a folder that results may be written to; `ValueError` if something else stands there.
+def output_folder(path: str | Path, files: Sequence[str] = ()) -> Path:
+    """`path` as a folder that results may be written to.
 
     Asked before the work starts: a run of minutes must not end in a name that cannot be written.
+
+    Args:
+        path: of the folder, which need not be there.
+        files: names of the results.
+
+    Raises:
+        ValueError: something else stands there, or nothing may be written to it.
+        FileExistsError: a link, a device or a folder has the name of a result.
     """
     folder = Path(path)
     existing = next(p for p in (folder, *folder.absolute().parents) if p.exists())
@@ -33,6 +41,8 @@ def output_folder(path: str | Path) -> Path:
         raise ValueError(f"--out {folder}: {existing} is a file, not a folder; choose another folder")
     if not os.access(existing, os.W_OK | os.X_OK):
         raise ValueError(f"--out {folder}: no permission to write in {existing}; choose another folder")
+    for file in files:
+        refuse_special(folder / file)
     return folder
 
 

@@ -13,7 +13,7 @@ from .population import Population
 from .rollback import RollbackStates
 from .spatial_sort import SpatialSort
 from .state.checks import check_arrays, check_members, check_time
-from .state.neighbour_list import PairSearch
+from .state.neighbour_list import PairSearch, rows_carried
 from .state.particles import Particles, frozen, rows_frozen
 from .state.record import Record
 from .stepping.coefficients import Coefficients, Parameters
@@ -100,12 +100,10 @@ class AdvancingRun:
         longest = self._longest_step(until)
         for stop in self.domain.breaks(self.time, until):
             self.surroundings.enter(self.time, stop, valve_strength=self.parameters.valve_strength)
-            self.particles = self.surroundings.prepare(self.particles)
-            self._forget_pairs()
+            self._renumbered(self.surroundings.prepare(self.particles))
             self._advance_interval(stop, longest)
             self.time = stop
-            self.particles = self.surroundings.finish(self.particles, self.record, stop, self._stepper.pressure)
-            self._forget_pairs()
+            self._renumbered(self.surroundings.finish(self.particles, self.record, stop, self._stepper.pressure))
         self.particles, self._acceleration = self._spatial.end(self.particles, self._acceleration)
         self.record.searches = self._stepper.pair_search.searches
         self.record.overflows = self._backend.overflows
@@ -117,7 +115,8 @@ class AdvancingRun:
         longest = (until - self.time) / (scheme.steps_per_frame or 1)
         if scheme.max_step is not None:
             longest = min(longest, scheme.max_step)
-        return longest / self.units.time
+        longest /= self.units.time
+        return longest if scheme.longest_step is None else min(longest, scheme.longest_step)
 
     def _advance_interval(self, stop: float, longest: float) -> None:
         duration = (stop - self.time) / self.units.time
@@ -165,12 +164,13 @@ class AdvancingRun:
 
         Particles that have crossed an open valve change sides in every step: the flow must not feel the search.
         """
-        self.particles, renumbered = self.surroundings.exchange(self.particles, self.record, self._stepper.pressure)
+        particles, renumbered = self.surroundings.exchange(self.particles, self.record, self._stepper.pressure)
         if self._population is not None:
-            self.particles, changed = self._population.controlled_when_due(self.particles, active)
+            particles, changed = self._population.controlled_when_due(particles, active)
             renumbered |= changed
         if renumbered:
-            self._forget_pairs()
+            self._acceleration = rows_carried(self.particles, particles, self._acceleration)
+        self.particles = particles
         if self._pressures is not None:
             self.particles = self._pressures.driven(self.particles, self.surroundings.clock, self._stepper)
         self.particles, self._acceleration = self._spatial.when_due(self.particles, self._acceleration)
@@ -218,6 +218,12 @@ class AdvancingRun:
             self.particles = frozen(broken, before, self.particles)
         freeze_members(broken, self.record, self.time)
         return done
+
+    def _renumbered(self, particles: Particles) -> None:
+        """Go on with these particles, of which any may be new or gone."""
+        self._acceleration = rows_carried(self.particles, particles, self._acceleration)
+        self.particles = particles
+        self._stepper.pair_search.forget()
 
     def _forget_pairs(self) -> None:
         self._stepper.pair_search.forget()

@@ -245,15 +245,21 @@ class Scene:
         return value
 
     @classmethod
-    def from_recording(cls, recording: geometry.Recording, spacing: float | None = None) -> Scene:
+    def from_recording(
+        cls,
+        recording: geometry.Recording,
+        spacing: float | None = None,
+        *,
+        estimates: geometry.Estimates | None = None,
+    ) -> Scene:
         """The fluid, the moving walls and the valves of a recording: only what it has.
 
         ``spacing`` defaults to the smallest grid spacing. The reference speed is 1 m/s, typical of the heart, so that
         the same scene results from a noisy and from a clean recording. Walls that flicker are estimated, and valve
-        times that the recording lacks or cannot mean (``geometry.estimated``).
+        times that the recording lacks or cannot mean (``geometry.estimated``), unless ``estimates`` holds them already.
         """
         recording.wall_for("the simulator")
-        recording = geometry.estimated(recording).recording
+        recording = (geometry.estimated(recording) if estimates is None else estimates).recording
         intervals = recording.valve_intervals_or_derived()
         regions: dict[int, list[tuple[float, float]]] = {}
         span = (float(recording.time[0]), max(float(recording.time[-1]), float(recording.time[0]) + recording.period))

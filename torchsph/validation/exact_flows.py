@@ -125,6 +125,7 @@ PERIODIC_PROJECTION: ProjectionOptions = {
     "courant": 0.4,
     "tolerance": 1.25e-2,
     "max_step": None,
+    "longest_step": None,
 }
 # In space the shape of the vortices changes all the time and the step is what counts: 24^3 at Re 100 lose 10 % of their
 # kinetic energy too much with the fraction of the plane, 1 % with this one, which is still half of the time above.

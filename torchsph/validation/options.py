@@ -32,3 +32,4 @@ class ProjectionOptions(TypedDict, total=False):
     courant: float
     tolerance: float
     max_step: float | None
+    longest_step: float | None

@@ -1,11 +1,13 @@
 """Forecasts of a grid: they beat persistence on a flow whose future is known, and pool errors as documented."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
 import geometry
-from torchsph import Scene, Simulator, Transfer, skill
+from torchsph import NumericalFailure, Scene, Simulator, Transfer, skill
 from torchsph.simulator.grid_forecast import GridForecast
 
 BALL = geometry.ellipsoid((0.008, 0.008, 0.008), 1.5e-3)
@@ -77,3 +79,14 @@ def test_a_lead_that_no_frame_has_is_refused(recording, model):
 def test_options_are_checked():
     with pytest.raises(ValueError, match="Transfer.fade"):
         Transfer(fade=0.0)
+
+
+def test_a_start_that_fails_is_named_and_the_others_count(recording, model):
+    wild = np.array(recording.velocity)
+    wild[1] *= 1e30
+    result = skill(replace(recording, velocity=wild), model, (0.005,))
+    assert [(one["frame"], one["time"]) for one in result.failures] == [(1, 0.005)]
+    assert "failed" in result.failures[0]["reason"]
+    assert result.leads[0]["starts"] == 2
+    with pytest.raises(NumericalFailure, match="all 1 starts failed"):
+        skill(replace(recording, velocity=wild).select([1, 2]), model, (0.005,))

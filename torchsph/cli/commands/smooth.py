@@ -11,6 +11,8 @@ from torchsph.methods.measurement.frame_splines import smooth as smooth_recordin
 from ..checks import full_vectors, informative, output_file
 from ..command import Command
 from ..printing import print_table, say
+from ..running.notes import shows_bar
+from ..running.provenance import provenance
 
 
 def _arguments(parser: argparse.ArgumentParser) -> None:
@@ -23,8 +25,8 @@ def smooth(args: argparse.Namespace) -> None:
     path = output_file(args.out)
     measured = full_vectors(geometry.read_recording(args.measurement), args.measurement)
     informative(measured, args.measurement, weighed=False)
-    smoothed = smooth_recording(measured, progress=True)
-    geometry.write_recording(path, smoothed)
+    smoothed = smooth_recording(measured, progress=shows_bar(args))
+    geometry.write_recording(path, smoothed, provenance=provenance(args, {"measurement": args.measurement}))
     scores = {name: metrics.evaluate(one, None, measured) for name, one in (("raw", measured), ("spline", smoothed))}
     print_table(figures.scores_table(scores, {}))
     say(f"wrote {len(smoothed.time)} frames to {path}")

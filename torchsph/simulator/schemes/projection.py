@@ -36,6 +36,8 @@ class Projection(Scheme):
         valve: model for scenes with valves; they stay shut with None.
         courant: fraction of the limits h / v, h^2 / (8 nu) and sqrt(h / |a|) / 2.
         max_step: s, or None.
+        longest_step: longest step in spacings per reference speed, or None: what particles resolve in time goes with
+            what they resolve in space.
         steps_per_frame: at least so many steps between imposed frames, or None.
         population: how particles that crowd are merged and holes seeded again, or None: neither.
     """
@@ -57,6 +59,7 @@ class Projection(Scheme):
     valve: ValveOptions | None = field(default_factory=lambda: Reservoir(run_out=3.0))
     courant: float = 0.27
     max_step: float | None = 5e-4
+    longest_step: float | None = None
     steps_per_frame: int | None = None
     population: PopulationControl | None = None
 
@@ -65,7 +68,7 @@ class Projection(Scheme):
         for name in ("smoothing_ratio", "courant", "tolerance"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"Projection.{name} must be positive, got {getattr(self, name)}")
-        for name in ("shifting", "shifting_surface", "relaxation", "max_step"):
+        for name in ("shifting", "shifting_surface", "relaxation", "max_step", "longest_step"):
             value = getattr(self, name)
             if value is not None and not value > 0:
                 raise ValueError(f"Projection.{name} must be positive or None, got {value}")

@@ -28,6 +28,7 @@ class Scheme:
         steps_per_frame: at least so many steps between imposed frames, or None.
         population: how particles that crowd are merged and holes seeded again, or None: neither.
         max_step: s, longest step, or None.
+        longest_step: the same in spacings per reference speed, or None.
         step_floor: smallest step as a fraction of the acoustic limit of the fluid at rest, or None.
         xsph: velocity smoothing, or None.
         gamma_ramp: how gamma grows after an imposition, or None.
@@ -50,6 +51,7 @@ class Scheme:
     steps_per_frame: int | None
     population: PopulationControl | None
     max_step: float | None = None
+    longest_step: float | None = None
     step_floor: float | None = None
     xsph: XSPH | None = None
     gamma_ramp: GammaRamp | None = None

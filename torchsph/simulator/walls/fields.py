@@ -24,9 +24,9 @@ _STRAY = 2.0
 # this far beyond the kernel's reach (spacings) the kernel is complete and nothing else of the wall is asked for
 _FAR = 1.0
 # fields kept: the beat is run through in order, and a forecast of 40 ms spans about ten of them
-_KEPT = 24
+_KEPT = 12
 # of small grids more are kept, so that a second beat finds those of the first (bytes)
-_MEMORY = 1 << 29
+_MEMORY = 1 << 27
 
 
 class WallFields:
