@@ -52,10 +52,10 @@ class Valve:
             is linear between its times and repeats with ``period``. The other open valves take what it leaves of the
             change of the cavity's volume. None: this one does, beside others by what each carries when a field is
             imposed.
-        flux_sigma: m^3/s, standard deviation of ``flux``. Where no open valve is left to take the rest, uncertain fluxes
-            are moved, each by its variance, until they sum to the change of the cavity's volume. 0: exact.
-        leak: part of the opening's area that stays open while the valve is shut, from 0 to below 1: a soft closed valve.
-            It passes what an imposed field has there, or shares by that area. None: shut is shut.
+        flux_sigma: m^3/s, standard deviation of ``flux``. Where no open valve is left to take the rest, uncertain
+            fluxes are moved, each by its variance, until they sum to the change of the cavity's volume. 0: exact.
+        leak: part of the opening's area that stays open while the valve is shut, from 0 to below 1: a soft closed
+            valve. It passes what an imposed field has there, or shares by that area. None: shut is shut.
         stagnation: whether ``pressure`` is that of still fluid behind the valve, of which fluid that enters has spent
             rho v^2 / 2 (Bernoulli), or the static pressure in the opening itself. Fluid leaves against either alike.
     """
@@ -243,8 +243,8 @@ class Scene:
 
         ``spacing`` defaults to the smallest grid spacing. The reference speed is 1 m/s, typical of the heart, so that
         the same scene results from a noisy and from a clean recording. Walls that flicker are estimated, and valve
-        times that the recording lacks or cannot mean (``geometry.estimated``). A flux that the recording has measured is
-        that of its valve, with its error; where a shut valve leaks, by how much (``/valve/leak``).
+        times that the recording lacks or cannot mean (``geometry.estimated``). A flux that the recording has measured
+        is that of its valve, with its error; ``/valve/leak`` is the valve's leak.
         """
         recording.wall_for("the simulator")
         recording = geometry.estimated(recording).recording

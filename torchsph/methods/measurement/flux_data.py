@@ -1,7 +1,8 @@
 """What a frame's spline should pass through the openings: measured fluxes, and their sum where several are open.
 
-Openings that are open together leave the profile and the split of their flow to the data; that they pass dV/dt together
-is known (continuity), as well as the walls' motion is. A flux that was measured (``/flux/region_N``) counts by its error.
+Openings that are open together leave the profile and the split of their flow to the data; that they pass dV/dt
+together is known (continuity), as well as the walls' motion is. A flux that was measured (``/flux/region_N``) counts by
+its error.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ _FINEST = 1e-5
 
 
 class _Flux(NamedTuple):
-    """An equation: sum over points (n, D) of rows (n, D), m^2, times velocities is ``value``, give or take ``sigma``."""
+    """An equation: the sum over points (n, D) of rows (n, D), m^2, times velocities is ``value``, within ``sigma``."""
 
     points: np.ndarray
     rows: np.ndarray
