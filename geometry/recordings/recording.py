@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from geometry.grids.grid import Grid
+from geometry.surfaces.integers import narrowed
 from geometry.surfaces.surface import Surface
 
 from .errors import RecordingError
@@ -253,10 +254,15 @@ class Recording:
 def _coerce(instance: Wall | Recording, prefix: str) -> None:
     """Bring every array to its type; a recording keeps no reference to lists or other array types."""
     kinds = {name.removeprefix(prefix): kind for name, _, kind in LAYOUT if name.startswith(prefix)}
+    datasets = {name.removeprefix(prefix): dataset for name, dataset, _ in LAYOUT if name.startswith(prefix)}
     for item in fields(instance):
         value = getattr(instance, item.name)
         if item.name in kinds and value is not None:
-            object.__setattr__(instance, item.name, np.asarray(value, dtype=kinds[item.name]))
+            try:
+                array = narrowed(value, kinds[item.name])
+            except ValueError as fault:
+                raise RecordingError("recording", datasets[item.name], str(fault)) from fault
+            object.__setattr__(instance, item.name, array)
 
 
 def _check_shapes(recording: Recording) -> None:

@@ -12,6 +12,7 @@ from .failures import broken_members, freeze_members, without_lost
 from .population import Population
 from .rollback import RollbackStates
 from .spatial_sort import SpatialSort
+from .state.checks import check_arrays, check_members, check_time
 from .state.neighbour_list import PairSearch, rows_carried
 from .state.particles import Particles, frozen, rows_frozen
 from .state.record import Record
@@ -83,10 +84,15 @@ class AdvancingRun:
 
         Raises:
             NumericalFailure: no member is left; a member that fails before is frozen and flagged.
-            ValueError: ``until`` lies in the past.
+            ValueError: ``until`` is not finite, lies in the past or where the wall's motion is not known; or somebody
+                has put in particles whose arrays disagree.
         """
+        until = check_time(until, "the time to advance to")
+        check_arrays(self.particles, self.domain.scene.dimension, self.domain.dtype, self.domain.device)
+        check_members(self.particles)
         if until < self.time:
             raise ValueError(f"cannot advance backwards, from {self.time} s to {until} s")
+        self.domain.check_known(until)
         if until == self.time:
             return
         self.particles = without_lost(self.particles, self.record, self.time)

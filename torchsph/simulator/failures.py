@@ -46,9 +46,9 @@ def freeze_members(broken: Tensor, record: Record, time: float) -> None:
     if bool(record.failed.all()):
         raise NumericalFailure(
             f"all {record.members} members have failed (not finite, too fast for any step, or beyond the density that "
-            f"a rollback allows) after {record.steps.tolist()} steps at about {time:.6g} s; lower the Courant "
-            "fraction, raise the sound speed, or check the imposed velocity (largest Mach number "
-            f"{float(record.largest_mach.max()):.2f})"
+            f"a rollback allows) after {record.steps.tolist()} steps at about {time:.6g} s, at a largest Mach "
+            f"number of {float(record.largest_mach.max()):.2f}; look at the velocity and the walls around that "
+            "time; in Python, lower the scheme's courant or raise its sound_speed"
         )
 
 

@@ -18,6 +18,7 @@ from regularize.solvers.factor import Factor
 
 from ..runtime.parallel import shared
 from .flux_data import flux_data
+from .informative import refuse_silent
 from .wall_rows import at_knots, open_regions, wall_rows
 
 # noise and smoothness are chosen in every third frame and serve its neighbours: flow and noise change over tens of
@@ -53,6 +54,7 @@ class FrameSmoother:
     ) -> None:
         if choose_every < 1:
             raise ValueError(f"choose_every must be at least 1, got {choose_every}")
+        refuse_silent(recording)
         self.estimates = geometry.estimated(recording) if estimates is None else estimates
         recording = self.estimates.recording
         self.type = geometry.measurement_type(recording)
