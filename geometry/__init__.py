@@ -13,6 +13,7 @@ from .recordings.checks import findings
 from .recordings.errors import RecordingError
 from .recordings.finding import Finding
 from .recordings.measurement_types import MeasurementType, measurement_type
+from .recordings.quality import Quality
 from .recordings.read import read_provenance, read_recording
 from .recordings.recording import Recording, Wall
 from .recordings.rules import check_recording
@@ -40,6 +41,7 @@ __all__ = [
     "Opening",
     "Orifice",
     "OrificePlane",
+    "Quality",
     "Recording",
     "RecordingError",
     "Stencil",
