@@ -51,6 +51,7 @@ def summary_table(recording: geometry.Recording) -> list[list[str]]:
         "weight",
         "sigma",
         "uncovered",
+        "quality",
         "beam",
         "pressure",
         "volume",
