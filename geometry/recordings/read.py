@@ -16,6 +16,7 @@ from geometry.surfaces.integers import narrowed
 from .checks import refuse_implausible
 from .errors import RecordingError
 from .odd_files import brief, reading, refuse_oversized
+from .opening_flux import GROUP, fluxes_of, is_flux
 from .recording import LAYOUT, OF_A_WALL, REQUIRED, Recording, Wall
 from .rules import check_recording
 from .units import factor
@@ -31,6 +32,7 @@ QUANTITIES = {
     "/pressure": "pressure",
     "/wall/vertices": "length",
     "/wall/velocity": "velocity",
+    "/wall/sigma": "length",
 }
 SOFT_LINKS = 16  # a chain longer than this is a circle
 
@@ -116,12 +118,25 @@ def _datasets(file: h5py.File, source: str) -> dict[str, tuple[h5py.Dataset, typ
                 found[dataset] = _numbers(node, dataset, source), kind
         if node is None and dataset in REQUIRED:
             raise RecordingError(source, dataset, "is required but missing")
+    for dataset in _flux_names(file, source):
+        with reading(source, dataset):
+            node = _resolve(file, dataset, source)
+            if node is not None:
+                found[dataset] = _numbers(node, dataset, source), np.float64
     there = [dataset for dataset in found if dataset.startswith("/wall/")]
     for dataset in OF_A_WALL if there else ():
         if dataset not in found:
             rule = f"is required but missing, beside {there[0]}; or leave all of /wall out"
             raise RecordingError(source, dataset, rule)
     return found
+
+
+def _flux_names(file: h5py.File, source: str) -> list[str]:
+    """The datasets of measured fluxes that are there; other names under /flux are none of the format's, or fixed."""
+    with reading(source, GROUP):
+        group = _resolve(file, GROUP, source)
+        names = [f"{GROUP}/{name}" for name in group] if isinstance(group, h5py.Group) else []
+    return sorted(name for name in names if is_flux(name))
 
 
 def _outline(node: h5py.Dataset, dataset: str, kind: type, source: str) -> np.ndarray:
@@ -135,7 +150,7 @@ def _outline(node: h5py.Dataset, dataset: str, kind: type, source: str) -> np.nd
 def _built(file: h5py.File, grid: Grid, arrays: Mapping[str, np.ndarray], source: str) -> Recording:
     names = {dataset: name for name, dataset, _ in LAYOUT}
     wall: dict[str, Any] = {names[d].removeprefix("wall."): a for d, a in arrays.items() if d.startswith("/wall/")}
-    rest: dict[str, Any] = {names[d]: a for d, a in arrays.items() if not d.startswith("/wall/")}
+    rest: dict[str, Any] = {names[d]: a for d, a in arrays.items() if d in names and not d.startswith("/wall/")}
     numbers: dict[str, Any] = {name: _number(file, name, source) for name in ("rho", "mu")}
     period = _number(file, "period", source) if "period" in file.attrs else 0.0
     try:
@@ -144,6 +159,7 @@ def _built(file: h5py.File, grid: Grid, arrays: Mapping[str, np.ndarray], source
             wall=Wall(**wall) if wall else None,
             period=period,
             description=_text(file, "description", source),
+            fluxes=fluxes_of(arrays),
             **numbers,
             **rest,
         )

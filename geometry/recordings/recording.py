@@ -18,6 +18,7 @@ from geometry.surfaces.integers import narrowed
 from geometry.surfaces.surface import Surface
 
 from .errors import RecordingError
+from .opening_flux import OpeningFlux, check_distinct
 
 # Field of `Recording` (after a dot: of its wall), dataset, type in memory and in the file.
 LAYOUT: tuple[tuple[str, str, type], ...] = (
@@ -27,13 +28,16 @@ LAYOUT: tuple[tuple[str, str, type], ...] = (
     ("weight", "/weight", np.float32),
     ("sigma", "/sigma", np.float32),
     ("uncovered", "/uncovered", np.int64),
+    ("quality", "/quality", np.uint8),
     ("beam", "/beam", np.float32),
     ("pressure", "/pressure", np.float32),
     ("wall.vertices", "/wall/vertices", np.float64),
     ("wall.faces", "/wall/faces", np.int32),
     ("wall.region", "/wall/region", np.uint8),
     ("wall.velocity", "/wall/velocity", np.float32),
+    ("wall.sigma", "/wall/sigma", np.float32),
     ("valve_intervals", "/valve/intervals", np.float64),
+    ("valve_leak", "/valve/leak", np.float64),
     ("valve_open", "/valve_open", np.uint8),
     ("volume", "/volume", np.float64),
     ("flux_mitral", "/flux/mitral", np.float64),
@@ -56,12 +60,14 @@ class Wall:
         faces: (nf, D), vertex numbers, normals outwards.
         region: (nf,), 0 wall, 1 mitral inlet, 2 aortic outlet, further ones free.
         velocity: (T, nv, D), m/s, or None: it then follows from `vertices`.
+        sigma: (T, nv) or (nv,), m, standard deviation of a vertex's place; None: nothing is known of it.
     """
 
     vertices: np.ndarray
     faces: np.ndarray
     region: np.ndarray
     velocity: np.ndarray | None = None
+    sigma: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         _coerce(self, "wall.")
@@ -78,7 +84,9 @@ class Wall:
     def select(self, frames: slice | Sequence[int] | np.ndarray) -> Wall:
         """The wall at some of the frames."""
         vertices = self.vertices[frames] if self.moves else self.vertices
-        return replace(self, vertices=vertices, velocity=None if self.velocity is None else self.velocity[frames])
+        velocity = None if self.velocity is None else self.velocity[frames]
+        sigma = self.sigma if self.sigma is None or self.sigma.ndim == 1 else self.sigma[frames]
+        return replace(self, vertices=vertices, velocity=velocity, sigma=sigma)
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,13 +106,16 @@ class Recording:
         weight: (T, *shape), confidence in [0, 1]; the velocity may be NaN where it is 0.
         sigma: (T, D, *shape), m/s, standard deviation of each component.
         uncovered: (T,), nodes inside the mask for which a method has no value.
+        quality: (T, *shape), codes of `Quality`: why an analysis is what it is at each node.
         beam: (T, D, *shape) or (D, *shape), unit vectors along which alone the velocity was measured.
         pressure: (T, *shape), Pa, gauge.
         valve_intervals: (n, 3), rows (region, opens, closes), s.
+        valve_leak: (n, 2), rows (region, part of its area that stays open while it is shut).
         valve_open: (T, 2), regions 1 and 2 open at the frames; used where there are no intervals.
         volume: (T,), m^3.
         flux_mitral: (T,), m^3/s, positive into the ventricle.
         flux_aortic: (T,), m^3/s, likewise.
+        fluxes: measured fluxes of regions, with their errors.
 
     Raises:
         RecordingError: shapes that disagree; `geometry.check_recording` tests every rule of the format.
@@ -122,13 +133,16 @@ class Recording:
     weight: np.ndarray | None = None
     sigma: np.ndarray | None = None
     uncovered: np.ndarray | None = None
+    quality: np.ndarray | None = None
     beam: np.ndarray | None = None
     pressure: np.ndarray | None = None
     valve_intervals: np.ndarray | None = None
+    valve_leak: np.ndarray | None = None
     valve_open: np.ndarray | None = None
     volume: np.ndarray | None = None
     flux_mitral: np.ndarray | None = None
     flux_aortic: np.ndarray | None = None
+    fluxes: tuple[OpeningFlux, ...] = ()
 
     def __post_init__(self) -> None:
         _coerce(self, "")
@@ -136,6 +150,7 @@ class Recording:
             object.__setattr__(self, name, float(getattr(self, name)))
         if self.mask.shape == self.grid.shape:
             object.__setattr__(self, "mask", np.broadcast_to(self.mask, (len(self.time), *self.grid.shape)))
+        check_distinct(self.fluxes)
         _check_shapes(self)
 
     @property
@@ -155,6 +170,8 @@ class Recording:
             value = getattr(self.wall, name[5:], None) if name.startswith("wall.") else getattr(self, name)
             if value is not None:
                 found[dataset] = value
+        for flux in self.fluxes:
+            found |= flux.arrays()
         return found
 
     def check(self, source: str = "recording") -> None:
@@ -190,9 +207,10 @@ class Recording:
         """
         chosen = np.arange(self.frames)[frames if isinstance(frames, slice) else np.asarray(frames)]
         changes: dict[str, Any] = {"wall": None if self.wall is None else self.wall.select(chosen)}
+        changes["fluxes"] = tuple(flux.select(chosen) for flux in self.fluxes)
         for name, _, _ in LAYOUT:
             value = None if name.startswith("wall.") else getattr(self, name)
-            still = name == "valve_intervals" or (
+            still = name in ("valve_intervals", "valve_leak") or (
                 name == "beam" and value is not None and value.ndim == self.dimension + 1
             )
             if value is not None and not still:
@@ -205,15 +223,17 @@ class Recording:
         *,
         sigma: np.ndarray | None = None,
         uncovered: np.ndarray | None = None,
+        quality: np.ndarray | None = None,
         description: str | None = None,
     ) -> Recording:
         """Another velocity (T, D, *shape), m/s, between the same walls: an analysis or a forecast.
 
-        What belonged to the old velocity (weight, sigma, beam, pressure, fluxes) is dropped.
+        What belonged to the old velocity (weight, sigma, quality, beam, pressure, fluxes) is dropped.
         """
         gone: dict[str, Any] = dict.fromkeys(("weight", "beam", "pressure", "flux_mitral", "flux_aortic"))
         text = self.description if description is None else description
-        return replace(self, velocity=velocity, sigma=sigma, uncovered=uncovered, description=text, **gone)
+        new: dict[str, Any] = {"velocity": velocity, "sigma": sigma, "uncovered": uncovered, "quality": quality}
+        return replace(self, **new, description=text, fluxes=(), **gone)
 
     def valve_intervals_or_derived(self) -> np.ndarray:
         """Rows (region, opens, closes), `(n, 3)`, s: `/valve/intervals`, or else derived from `/valve_open`.
@@ -265,21 +285,24 @@ def _check_shapes(recording: Recording) -> None:
 def _allowed_shapes(recording: Recording) -> dict[str, tuple[tuple[int, ...], ...]]:
     """The shapes that each dataset may have, given the frames, the grid and the size of the wall."""
     frames, dimension, shape = recording.time.shape[0], recording.grid.dimension, recording.grid.shape
-    intervals = recording.valve_intervals
+    intervals, leak = recording.valve_intervals, recording.valve_leak
     return {
         "/velocity": ((frames, dimension, *shape),),
         "/mask": ((frames, *shape),),
         "/weight": ((frames, *shape),),
         "/sigma": ((frames, dimension, *shape),),
         "/uncovered": ((frames,),),
+        "/quality": ((frames, *shape),),
         "/beam": ((frames, dimension, *shape), (dimension, *shape)),
         "/pressure": ((frames, *shape),),
         **({} if recording.wall is None else _allowed_wall_shapes(recording.wall, frames, dimension)),
         "/valve/intervals": ((len(intervals) if intervals is not None and intervals.ndim else 0, 3),),
+        "/valve/leak": ((len(leak) if leak is not None and leak.ndim else 0, 2),),
         "/valve_open": ((frames, 2),),
         "/volume": ((frames,),),
         "/flux/mitral": ((frames,),),
         "/flux/aortic": ((frames,),),
+        **{dataset: ((frames,),) for flux in recording.fluxes for dataset in flux.arrays()},
     }
 
 
@@ -291,4 +314,5 @@ def _allowed_wall_shapes(wall: Wall, frames: int, dimension: int) -> dict[str, t
         "/wall/faces": ((faces, dimension),),
         "/wall/region": ((faces,),),
         "/wall/velocity": ((frames, *points),),
+        "/wall/sigma": ((frames, points[0]), points[:1]),
     }

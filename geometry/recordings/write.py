@@ -10,6 +10,7 @@ import h5py
 import numpy as np
 
 from .checks import refuse_implausible
+from .quality import QUALITY_NAMES
 from .recording import Recording
 from .rules import check_recording
 from .whole_file import refuse_special, write_whole
@@ -81,4 +82,6 @@ def _fill(file: h5py.File, recording: Recording) -> None:
         # One chunk a frame: a frame is what is read at a time. Small and empty arrays are stored as they are.
         many = values.ndim > 2 and values.size > 0
         options = {"chunks": (1, *values.shape[1:]), "compression": "gzip", "shuffle": True} if many else {}
-        file.create_dataset(dataset, data=values, **options)
+        stored = file.create_dataset(dataset, data=values, **options)
+        if dataset == "/quality":
+            stored.attrs["names"] = list(QUALITY_NAMES)

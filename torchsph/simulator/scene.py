@@ -5,11 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
 import geometry
 
+# s: beyond every time of a recording
+_FOREVER = 1e12
+# m^3/s: a measured flux is never exact, however it is stated
+_LEAST_SIGMA = 1e-12
 # labels of faces are bytes
 _MOST_REGION = 255
 # openings and closings of a valve in one stretch of time: more are a slip in its period
@@ -51,6 +56,10 @@ class Valve:
             is linear between its times and repeats with ``period``. The other open valves take what it leaves of the
             change of the cavity's volume. None: this one does, beside others by what each carries when a field is
             imposed.
+        flux_sigma: m^3/s, standard deviation of ``flux``. Where no open valve is left to take the rest, uncertain
+            fluxes are moved, each by its variance, until they sum to the change of the cavity's volume. 0: exact.
+        leak: part of the opening's area that stays open while the valve is shut, from 0 to below 1: a soft closed
+            valve. It passes what an imposed field has there, or shares by that area. None: shut is shut.
         stagnation: whether ``pressure`` is that of still fluid behind the valve, of which fluid that enters has spent
             rho v^2 / 2 (Bernoulli), or the static pressure in the opening itself. Fluid leaves against either alike.
     """
@@ -62,6 +71,8 @@ class Valve:
     pressure: float | Callable[[float], float] | None = None
     stagnation: bool = True
     flux: float | Callable[[float], float] | tuple[Sequence[float], Sequence[float]] | None = None
+    flux_sigma: float = 0.0
+    leak: float | None = None
 
     def __post_init__(self) -> None:
         if self.region != int(self.region) or not 1 <= self.region <= _MOST_REGION:
@@ -82,6 +93,11 @@ class Valve:
             raise ValueError(f"valve of region {self.region}: give its flux or its pressure, not both")
         if isinstance(self.flux, tuple):
             self._check_table(self.flux)
+        if not 0 <= self.flux_sigma < math.inf:
+            given = f"got {self.flux_sigma}"
+            raise ValueError(f"Valve.flux_sigma of region {self.region} must be finite, not negative (m^3/s), {given}")
+        if self.leak is not None and not 0 <= self.leak < 1:
+            raise ValueError(f"Valve.leak of region {self.region} must lie in [0, 1) or be None, got {self.leak}")
 
     def _check_table(self, table: tuple[Sequence[float], Sequence[float]]) -> None:
         """Raise ValueError where a table of fluxes has no times that increase, or a flux that is not finite."""
@@ -140,6 +156,14 @@ class Valve:
             times = [time] + [t for t in (time - self.period, time + self.period) if not first <= t <= last]
         return any(opening <= t < closing for opening, closing in self.intervals for t in times)
 
+    def passes(self, time: float) -> bool:
+        """Whether anything may go through at ``time`` (s): the valve is open, or leaks."""
+        return bool(self.leak) or self.is_open(time)
+
+    def open_part(self, time: float) -> float:
+        """Part of the opening's area that is open at ``time`` (s)."""
+        return 1.0 if self.is_open(time) else self.leak or 0.0
+
     def events(self, start: float, stop: float) -> list[float]:
         """Times in [start, stop], s, at which the valve may open or close."""
         times = [t for interval in self.intervals for t in interval]
@@ -197,7 +221,8 @@ class Scene:
             raise ValueError(f"Scene.dimension must be 2 or 3, got {self.dimension}")
         if not 0 < self.reference_speed < math.inf:
             raise ValueError(f"Scene.reference_speed must be positive and finite (m/s), got {self.reference_speed}")
-        if self.valves and all(valve.flux is not None for valve in self.valves):
+        exact = [valve.flux is not None and not valve.flux_sigma for valve in self.valves]
+        if self.valves and all(exact):
             raise ValueError(
                 "every valve has a given flux: leave the flux of at least one to what is left of dV/dt (flux=None)"
             )
@@ -257,6 +282,8 @@ class Scene:
         ``spacing`` defaults to the smallest grid spacing. The reference speed is 1 m/s, typical of the heart, so that
         the same scene results from a noisy and from a clean recording. Walls that flicker are estimated, and valve
         times that the recording lacks or cannot mean (``geometry.estimated``), unless ``estimates`` holds them already.
+        A flux that the recording has measured is that of its valve, with its error; ``/valve/leak`` is the valve's
+        leak.
         """
         recording.wall_for("the simulator")
         recording = (geometry.estimated(recording) if estimates is None else estimates).recording
@@ -270,8 +297,19 @@ class Scene:
                 closing = float(closing) if math.isfinite(closing) else span[1]
             rows.append((float(opening), float(closing)))
         present = {int(region) for region in recording.wall_for("the simulator").region}
+        rows_of_leak = [] if recording.valve_leak is None else recording.valve_leak.tolist()
+        leak = {int(region): part for region, part in rows_of_leak if part > 0}
+        measured = {flux.region: flux for flux in recording.fluxes}
         valves = tuple(
-            Valve(r, tuple(sorted(rows)), recording.period, span) for r, rows in sorted(regions.items()) if r in present
+            Valve(
+                region,
+                tuple(sorted(regions.get(region, []))),
+                recording.period,
+                span,
+                leak=leak.get(region),
+                **_given_flux(measured.get(region), recording),
+            )
+            for region in sorted((set(regions) | set(leak)) & present)
         )
         return cls(
             spacing=float(min(recording.grid.spacing)) if spacing is None else spacing,
@@ -280,3 +318,13 @@ class Scene:
             valves=valves,
             dimension=recording.dimension,
         )
+
+
+def _given_flux(flux: geometry.OpeningFlux | None, recording: geometry.Recording) -> dict[str, Any]:
+    """A measured flux as a valve's: beyond the frames of a recording that does not repeat it stays what it was last."""
+    if flux is None:
+        return {}
+    times, values = [float(t) for t in recording.time], [float(value) for value in flux.value]
+    if not recording.period:
+        times, values = [-_FOREVER, *times, _FOREVER], [values[0], *values, values[-1]]
+    return {"flux": (times, values), "flux_sigma": max(float(np.sqrt(np.mean(flux.deviation**2))), _LEAST_SIGMA)}

@@ -23,6 +23,7 @@ from .analyses import Analyses
 from .forecast_spread import ForecastSpread
 from .forecaster import Ensemble, Forecaster
 from .options import EnsembleOptions
+from .quality import analysed_codes, first_codes
 
 
 class Cycle:
@@ -92,7 +93,8 @@ class Cycle:
         [(control, draws)] = shared([partial(self._first, generator)])
         parameters = {one.parameter.name: one.draw(self.count, self.generator) for one in self.options.estimated}
         self._ensemble = Ensemble(control, control + draws, parameters).centred()
-        self.analyses.add(self.ensemble, control, torch.where(mask, self.ensemble.members.std(0), 0.0), 0)
+        sigma = torch.where(mask, self.ensemble.members.std(0), 0.0)
+        self.analyses.add(self.ensemble, control, sigma, first_codes(self.measurements[0], mask), 0)
 
     def _first(self, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """The first control (D, *shape), and deviations of the members (N, D, *shape)."""
@@ -129,10 +131,12 @@ class Cycle:
             self.analyser.coast()
             self.analyses.happened(frame, coasted=True)
             self._ensemble = states[-1]
-            sigma = torch.where(late, self.ensemble.members.std(0), 0.0)
+            sigma, reason = torch.where(late, self.ensemble.members.std(0), 0.0), torch.empty(0)
         else:
             self._ensemble, sigma = self.analyser.analyse(states[-1], batch, frame)
-        self.analyses.add(self.ensemble, torch.where(late, self.ensemble.control, 0.0), sigma, missing)
+            reason = self.analyser.reason
+        quality = analysed_codes([] if batch is None else batch.parts, reason, late, forecasts.covered, self.grid)
+        self.analyses.add(self.ensemble, torch.where(late, self.ensemble.control, 0.0), sigma, quality, missing)
 
     def _count_alive(self, failed: Tensor, time: float) -> None:
         """Count the members that are not among the failed (N,); refuse to go on where too few are left."""

@@ -17,8 +17,9 @@ import regularize
 from regularize.solvers.factor import Factor
 
 from ..runtime.parallel import shared
+from .flux_data import flux_data
 from .informative import refuse_silent
-from .wall_rows import at_knots, wall_rows
+from .wall_rows import at_knots, open_regions, wall_rows
 
 # noise and smoothness are chosen in every third frame and serve its neighbours: flow and noise change over tens of
 # milliseconds, and a choice costs four times a fit
@@ -156,7 +157,9 @@ class FrameSmoother:
         """Rows of the walls at a frame; None where the recording has no wall."""
         if self.motion is None:
             return None
-        return wall_rows(self.recording, self.motion, frame, at_rest=at_rest, sampler=self._sampler)
+        knots = self.smoother
+        distance = max(knots.knots_at(self.recording.grid.spacing)) if knots.nodes is None else 0.0
+        return wall_rows(self.recording, self.motion, frame, at_rest=at_rest, sampler=self._sampler, knots=distance)
 
     def _inside(self, frame: int) -> Tensor:
         """(n, D) nodes in the mask of a frame."""
@@ -176,16 +179,37 @@ class FrameSmoother:
         samples = torch.from_numpy(np.nan_to_num(field, copy=True)).double().T
         components = self.type.at(frame, torch.nonzero(used).squeeze(1))
         points, rows, confidence, beam = components.spline_rows(self.nodes[used], samples[used], weight[used])
-        return self.smoother.fit(
+        together = self._open_together(frame)
+        known_flux = self.motion is not None and (bool(recording.fluxes) or len(together) > 1) and self.type.full
+        fitted = self.smoother.fit(
             points,
             rows,
             confidence,
             self._walls(frame),
             divergence_points=self.nodes[mask],
             beam=beam,
-            uncertainty=uncertainty,
+            uncertainty=uncertainty or known_flux,
             choice=choice,
         )
+        return self._with_fluxes(fitted, frame, together, uncertainty=uncertainty) if known_flux else fitted
+
+    def _open_together(self, frame: int) -> tuple[int, ...]:
+        """Regions that are open at a frame; () without walls."""
+        return () if self.motion is None else open_regions(self.recording, float(self.recording.time[frame]))
+
+    def _with_fluxes(
+        self, fitted: regularize.SplineField, frame: int, together: tuple[int, ...], *, uncertainty: bool
+    ) -> regularize.SplineField:
+        """The spline with what is known of the fluxes through its openings."""
+        wall, data = self.estimates.wall, None
+        rate_sigma = 0.0 if wall is None else float(wall.rate_sigma[frame])
+        if self.motion is not None:
+            data = flux_data(self.recording, self.motion, frame, fitted, together, rate_sigma)
+        if data is not None:
+            fitted = regularize.with_linear_data(fitted, data)
+        if not uncertainty:
+            fitted.posterior = fitted.factor = None  # they take as much memory as all else together
+        return fitted
 
     @property
     def groups(self) -> int:

@@ -16,7 +16,7 @@ import torch.distributed as dist
 from geometry.recordings.whole_file import refuse_special, write_whole
 
 _NAME = b"torchsph checkpoint "
-_OPENING = _NAME + b"4\n"  # then the SHA-256 of all that follows its line, the key, and torch's own file
+_OPENING = _NAME + b"5\n"  # then the SHA-256 of all that follows its line, the key, and torch's own file
 
 
 def run_key(parts: Mapping[str, Sequence[object]]) -> str:
