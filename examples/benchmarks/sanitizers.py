@@ -107,7 +107,9 @@ def main() -> int:
             "TORCHSPH_ISA": args.isa,
             "PYTHONPATH": os.pathsep.join([scratch, os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep),
         }
-        call = [sys.executable, "-m", "pytest", "-n0", "-q", "-x", "-s", "-p", "sanitized_libraries", *args.tests]
+        # one test asks for instruction sets of its own
+        call = [sys.executable, "-m", "pytest", "-n0", "-q", "-x", "-s", "-k", "not instruction_set"]
+        call += ["-p", "sanitized_libraries", *args.tests]
         return subprocess.run(call, env=environment, check=False).returncode
 
 
