@@ -8,7 +8,7 @@ from torch import Tensor
 from torchsph.pairs.interface import Backend
 
 from .domain import Domain
-from .failures import broken_members, freeze_members, without_lost
+from .failures import broken_members, check_volume, freeze_members, without_lost
 from .population import Population
 from .rollback import RollbackStates
 from .spatial_sort import SpatialSort
@@ -72,6 +72,8 @@ class AdvancingRun:
             self._stepper.prescribed_kinds = self._pressures.kinds
         self._acceleration = torch.zeros_like(particles.position)
         self._began_at = self._imposed_at = self.time
+        holds = scene.valves and domain.walls is not None and scheme.valve is not None
+        self._filled = domain.filling(particles, self.time) if holds else None
         self._spatial = SpatialSort(search)
 
     @property
@@ -108,6 +110,8 @@ class AdvancingRun:
         self.record.searches = self._stepper.pair_search.searches
         self.record.overflows = self._backend.overflows
         self.surroundings.account(self.particles, self.record, self.time, self._began_at)
+        if self._filled is not None:
+            check_volume(self.record, self._filled, self.time)
 
     def _longest_step(self, until: float) -> float:
         """Limit of the steps to time ``until`` (s) that the scheme names outright, internal."""
