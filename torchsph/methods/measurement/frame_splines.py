@@ -64,7 +64,7 @@ class FrameSmoother:
         self.motion: geometry.WallMotion | None = None
         self._sampler: geometry.WallSampler | None = None
         if recording.wall is not None:
-            self.motion = geometry.WallMotion.from_recording(recording)
+            self.motion = _motion(recording)
             if smoother.nodes is None:
                 self.motion, self._sampler = at_knots(self.motion, max(smoother.knots_at(recording.grid.spacing)))
         self.recording, self.smoother, self.choose_every = recording, smoother, choose_every
@@ -295,6 +295,14 @@ class FrameSmoother:
         out = np.zeros((grid.dimension, grid.size), np.float32)
         out[:, mask] = fitted(self.nodes[torch.from_numpy(mask)], outside=0.0).T.numpy()
         return out.reshape(grid.dimension, *grid.shape)
+
+
+def _motion(recording: geometry.Recording) -> geometry.WallMotion:
+    """The motion of the walls; one frame alone is as fast as it says it is, though nobody knows where it goes."""
+    motion, wall = geometry.WallMotion.from_recording(recording), recording.wall_for("splines")
+    if motion.moves or wall.velocity is None:
+        return motion
+    return replace(motion, rates_at_keys=wall.velocity[:1].astype(np.float64))
 
 
 def smooth(
