@@ -22,6 +22,7 @@ from .ensemble.options import EnsembleOptions
 from .forecast_skill import ForecastSkill, skill
 from .free_run import run_freely
 from .measurement.prepared import PreparedMeasurement
+from .memory import MemoryPrediction, free_memory, predicted
 from .nudging import filter_sph
 from .runtime import checkpoint
 from .runtime.parallel import from_last, is_last, is_lead
@@ -105,6 +106,7 @@ def run_methods(
 
     Raises:
         ValueError: an unknown method, "sph" on a measurement of components alone, or a checkpoint of another run.
+        NotEnoughMemory: more would be needed than is free.
     """
     _check(methods, measured)
     if not methods:
@@ -112,13 +114,15 @@ def run_methods(
     smoother, timer = make_smoother(preset), _Timer()
     prepared = PreparedMeasurement(measured, smoother, progress=progress)
     models = _Models(prepared, preset, spacing, device)
+    count = DEFAULT_MEMBERS if members is None else members
+    predicted_memory(prepared, methods, preset, models.spacing, count, also).refuse_beyond(free_memory())
     ensemble = None
     if "ensemble" in methods:
         ensemble = _EnsembleCall(
             prepared,
             models,
             also,
-            members=DEFAULT_MEMBERS if members is None else members,
+            members=count,
             options=EnsembleOptions(lag=lag, minimum_members=minimum_members),
             truth=truth,
             checkpoints=None if checkpoints is None else Path(checkpoints),
@@ -142,6 +146,29 @@ def run_methods(
         done = ensemble.run(watcher, progress)
         results["ensemble"] = timer.result(done.recording, done.info | mended)
     return _collected(results)
+
+
+def predicted_memory(
+    prepared: PreparedMeasurement,
+    methods: Sequence[str],
+    preset: str = "default",
+    spacing: float | None = None,
+    members: int = DEFAULT_MEMBERS,
+    also: Sequence[geometry.Recording] = (),
+) -> MemoryPrediction:
+    """What ``run_methods`` with the same options will take."""
+    spacing = ANALYSIS_SPACING * min(prepared.recording.grid.spacing) if spacing is None else spacing
+    simulated = set(methods) - {"spline"}
+    runs = [(spacing, 1)] if simulated else []
+    if "ensemble" in methods:
+        runs = [(spacing, min(members, EnsembleOptions().batch)), (CONTROL_SHARE * spacing, 1)]
+    return predicted(
+        prepared,
+        scheme_preset(preset),
+        spacings=runs,
+        members=members if "ensemble" in methods else 0,
+        further=also,
+    )
 
 
 class _Models:

@@ -301,6 +301,29 @@ def test_a_child_gives_its_result_or_its_fault():
         child(lambda: {}["missing"])
 
 
+def test_info_reads_apart_and_tells_what_a_run_would_take(box_recording, tmp_path, monkeypatch, capsys):
+    import geometry
+    from torchsph.cli.commands import info
+
+    path = tmp_path / "m.h5"
+    measured = box_recording(lambda points, t: 0.1 + 0 * points, nodes=6)
+    geometry.write_recording(path, measured, provenance={"torchsph": "0.1.0", "seed": 0, "commit": "\x1b[2J"})
+    assert main(["info", str(path)]) == 0
+    plain = capsys.readouterr()
+    assert "made by" in plain.out and "commit \\x1b[2J" in plain.out
+    assert "GB for ensemble beside the program's own" in plain.out
+    assert main(["info", str(path), "--isolated"]) == 0
+    apart = capsys.readouterr()
+    assert apart.out.splitlines()[:-1] == plain.out.splitlines()[:-1] and apart.err == plain.err
+    monkeypatch.setattr(info.geometry, "read_recording", lambda _: crash())
+    assert main(["info", str(path), "--isolated"]) == 2
+    assert f"{path}: reading it ended a process by SIGSEGV" in capsys.readouterr().err
+    monkeypatch.setattr(info.geometry, "read_recording", lambda _: time.sleep(60))
+    assert main(["info", str(path), "--isolated", "--seconds", "0.2"]) == 2
+    assert "took longer than 0.2 s" in capsys.readouterr().err
+    assert main(["info", str(tmp_path / "gone.h5"), "--isolated"]) == 2
+
+
 # --- where results come from -----------------------------------------------------------------------
 
 

@@ -15,15 +15,11 @@ from ..exit_codes import ExitCode
 from ..outputs import output_folder, write_json
 from ..printing import print_table, say
 from ..running.child import Outcome, run_child
-from ..running.isolated import isolated
+from ..running.isolated import LEAST_MEMORY, SECONDS_TO_READ, TIMES_SIZE, isolated
 from ..running.items import Item, listed
 from ..running.provenance import fingerprint, input_digests
 from ..running.settings import as_arguments
 from . import assimilate
-
-# what a file may take to be read: s, and bytes for each of its own
-_SECONDS_TO_READ = 120.0
-_LEAST_MEMORY, _TIMES_SIZE = 2 << 30, 50
 
 DONE, BEFORE, FAILED, STOPPED = "done", "done before", "failed", "stopped"
 
@@ -111,8 +107,8 @@ def _finished(folder: Path) -> str | None:
 
 def _read_apart(source: Path) -> None:
     """Refuse a recording whose reading fails, hangs or crashes, at the cost of a fork."""
-    memory = _LEAST_MEMORY + _TIMES_SIZE * source.stat().st_size
-    isolated(lambda: bool(geometry.read_recording(source)), str(source), seconds=_SECONDS_TO_READ, memory=memory)
+    memory = LEAST_MEMORY + TIMES_SIZE * source.stat().st_size
+    isolated(lambda: bool(geometry.read_recording(source)), str(source), seconds=SECONDS_TO_READ, memory=memory)
 
 
 def _tell(item: Item, outcome: Outcome, state: str) -> None:

@@ -15,6 +15,10 @@ from typing import TypeVar
 
 T = TypeVar("T")
 
+# what the reading of a file may take: s; bytes, and as many for each of its own
+SECONDS_TO_READ = 120.0
+LEAST_MEMORY, TIMES_SIZE = 2 << 30, 50
+
 _KINDS: tuple[type[Exception], ...] = (MemoryError, FileNotFoundError, OSError, ValueError)
 
 

@@ -54,7 +54,8 @@ def wall_rows(
     """One row per wall point at a frame, weighted by area.
 
     A wall that stands sigma from where it is said to stand (``/wall/sigma``) tells of the flow there what a spline
-    changes by over sigma, so that its rows weigh 1 / (1 + (sigma / knots)^2) times as much.
+    changes by over sigma, so that its rows weigh 1 / (1 + (sigma / knots)^2) times as much beside the others; what that
+    makes of all of them is ``mean_certainty``.
 
     An orifice that alone is open carries the flux dV/dt as a plug. Where several are open, how they share it is for the
     data to say: they have no rows, and that their fluxes sum to dV/dt is an equation of its own (``flux_data``).
@@ -100,3 +101,10 @@ def _certainty(recording: geometry.Recording, frame: int, points: np.ndarray, kn
     # points may stand between the recording's own vertices: the nearest one's deviation is theirs
     nearest = cKDTree(wall.at(frame).vertices).query(points)[1]
     return 1.0 / (1.0 + (sigma[nearest].astype(np.float64) / knots) ** 2)
+
+
+def mean_certainty(recording: geometry.Recording, frame: int, knots: float) -> float:
+    """Mean factor on the rows of a frame's walls: 1 where ``/wall/sigma`` is not given."""
+    surface = recording.wall_for("wall rows").at(frame)
+    each = _certainty(recording, frame, surface.centroids, knots)
+    return each if isinstance(each, float) else float((each * surface.areas).sum() / surface.areas.sum())
