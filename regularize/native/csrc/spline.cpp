@@ -12,6 +12,7 @@
 
 #include "guard.hpp"
 #include "processor.hpp"
+#include "spline.hpp"
 
 #ifdef _OPENMP
 #include <omp.h>
@@ -33,40 +34,11 @@ constexpr int kCols = 2 * kWidth;     // tile columns: two vectors
 constexpr int kWorthThreads = 4096;   // rows: with fewer the threads' meetings cost more
 constexpr int kDepth = 32;            // points whose stencils are buffered before they are summed
 constexpr int kAhead = 16;             // rows whose targets are fetched before they are needed
-constexpr int kMaxComponents = 3;
-constexpr int kMaxAxes = 4;
-constexpr int kMaxOrder = 6;  // degree + 1
 
 // Inlined into a caller that knows the sizes at compile time, these small loops become straight vector code.
 #define SPLINE_INLINE inline __attribute__((always_inline))
 
 enum Kind : int32_t { kVector = 0, kDirection = 1, kDivergence = 2, kCellScalar = 3, kCellCoupled = 4 };
-
-}  // namespace
-
-extern "C" {
-
-struct SplineGrid {
-  int32_t axes, components, degree, padded;  // padded: local coefficients rounded up to the tile width
-  int32_t axis_of_component[kMaxAxes];       // place of component k's own axis among the solve axes
-  double spacing[kMaxAxes];                  // knot distance along the solve axes, m
-  double pieces[kMaxOrder * kMaxOrder];      // (degree + 1, degree + 1): row k holds the factors of t^k of each function
-  int64_t cells, nodes;                      // cells that hold rows, active coefficients
-  const int32_t* position;                   // (cells, local) solve positions, rising within a cell
-};
-
-struct SplineRows {
-  int32_t kind, shared;      // shared: all components have the same weight (kVector)
-  int64_t count;             // rows' points; 0 for the cell kinds
-  const int64_t* start;      // (cells + 1) points of each cell; for the cell kinds 0 or 1 blocks
-  const double* t;           // (count, axes) local coordinates, slowest solve axis first
-  const double* coefficient; // (count, components): weight, weight * direction, or weight in column 0
-  const double* gram;        // (local, local), or (C, C, local, local) for kCellCoupled
-};
-
-}  // extern "C"
-
-namespace {
 
 constexpr int power(int base, int exponent) { return exponent == 0 ? 1 : base * power(base, exponent - 1); }
 

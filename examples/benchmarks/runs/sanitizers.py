@@ -1,6 +1,6 @@
 """The compiled code of both packages under AddressSanitizer and UndefinedBehaviorSanitizer, in the tests that reach it.
 
-    python examples/benchmarks/sanitizers.py [--isa avx2] [--keep FOLDER] [TEST ...]
+    python examples/benchmarks/runs/sanitizers.py [--isa avx2] [--keep FOLDER] [TEST ...]
 
 Builds both libraries with g++ or clang++ ($CXX) and ``-fsanitize=address,undefined`` into a folder of their own, and
 runs the tests on them; the first finding ends a run with its stack. Leaks are not looked for: Python and torch keep
