@@ -14,7 +14,8 @@ from .recordings.errors import RecordingError
 from .recordings.finding import Finding
 from .recordings.measurement_types import MeasurementType, measurement_type
 from .recordings.opening_flux import OpeningFlux
-from .recordings.read import read_recording
+from .recordings.quality import Quality
+from .recordings.read import read_provenance, read_recording
 from .recordings.recording import Recording, Wall
 from .recordings.rules import check_recording
 from .recordings.write import write_recording
@@ -42,6 +43,7 @@ __all__ = [
     "OpeningFlux",
     "Orifice",
     "OrificePlane",
+    "Quality",
     "Recording",
     "RecordingError",
     "Stencil",
@@ -72,6 +74,7 @@ __all__ = [
     "openings",
     "orifices",
     "polygon",
+    "read_provenance",
     "read_recording",
     "read_surface",
     "refined",

@@ -12,6 +12,10 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 
+# One thread a process, children included, told before torch counts the cores: threads that wait for one another on a
+# busy machine cost many times what they save. Tests that are about threads set their number.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
 
 def _prefer_installed() -> None:
     """Test what was installed: `python -m pytest` puts the checkout first, which has no compiled kernels."""

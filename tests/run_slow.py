@@ -68,7 +68,7 @@ def parts(root: Path, paths: Sequence[str]) -> list[str]:
 def run(root: Path, part: str, checked_out: str) -> Run:
     """Run the slow tests of a file; what they print goes to the terminal."""
     started, clock = datetime.now(UTC), time.perf_counter()
-    command = [sys.executable, "-m", "pytest", "-q", "-m", "slow", part]
+    command = [sys.executable, "-m", "pytest", "-q", "-n", "0", "-m", "slow", part]
     lines = []
     with subprocess.Popen(command, cwd=root, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process:
         assert process.stdout is not None

@@ -8,6 +8,7 @@ import numpy as np
 
 from geometry.grids.grid import Grid
 from geometry.recordings.opening_flux import GROUP, fluxes_of, is_flux
+from geometry.recordings.quality import QUALITY_NAMES, Quality
 from geometry.recordings.recording import LAYOUT, Recording, Wall
 
 from .source import FormatError, missing_extra
@@ -20,6 +21,10 @@ ATTRIBUTES = {
     "velocity": {"units": "m s-1", "long_name": "velocity of the blood"},
     "mask": {"long_name": "1 in the blood", "flag_values": np.array([0, 1], np.int8), "flag_meanings": "outside blood"},
     "weight": {"units": "1", "long_name": "confidence"},
+    "quality": {
+        "flag_values": np.array(list(Quality), np.uint8),
+        "flag_meanings": " ".join(name.replace(" ", "_") for name in QUALITY_NAMES),
+    },
     "sigma": {"units": "m s-1", "long_name": "standard deviation of the velocity"},
     "beam": {"units": "1", "long_name": "unit vector along the beam"},
     "pressure": {"units": "Pa", "long_name": "pressure"},

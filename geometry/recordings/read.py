@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ import h5py
 import numpy as np
 
 from geometry.grids.grid import Grid
+from geometry.surfaces.integers import narrowed
 
 from .checks import refuse_implausible
 from .errors import RecordingError
@@ -64,6 +66,27 @@ def read_recording(path: str | Path) -> Recording:
     refuse_implausible(recording, source)
     recording.velocity[~np.broadcast_to(recording.mask[:, None], recording.velocity.shape)] = 0
     return recording
+
+
+def read_provenance(path: str | Path) -> dict[str, Any] | None:
+    """What a file's attribute `provenance` says of its making; None where there is none, or it cannot be understood.
+
+    Raises:
+        FileNotFoundError: there is no file.
+        RecordingError: it is no HDF5 file.
+    """
+    source = str(path)
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"{path}: there is no such file")
+    with reading(source, "file", "is not a readable HDF5 file"):
+        file = h5py.File(path, "r")
+    with file:
+        text = _text(file, "provenance", source)
+    try:
+        found = json.loads(text)
+    except ValueError:
+        return None
+    return found if isinstance(found, dict) else None
 
 
 def _read(file: h5py.File, source: str, size: int) -> Recording:
@@ -248,11 +271,12 @@ def _numbers(node: h5py.Group | h5py.Dataset | h5py.Datatype, dataset: str, sour
 
 
 def _load(node: h5py.Dataset, dataset: str, kind: type, source: str) -> np.ndarray:
-    values = _unpacked(node, np.asarray(node[()]), dataset, source)
-    if kind in (np.bool_, np.int32, np.uint8, np.int64):
-        _check_integers(values, dataset, kind, source)
-    with np.errstate(over="ignore"):  # a float64 too large for float32 becomes inf, which the rules then report
-        return values.astype(kind)
+    try:
+        return narrowed(_unpacked(node, np.asarray(node[()]), dataset, source), kind)
+    except RecordingError:
+        raise
+    except ValueError as fault:
+        raise RecordingError(source, dataset, str(fault)) from fault
 
 
 def _unpacked(node: h5py.Dataset, values: np.ndarray, dataset: str, source: str) -> np.ndarray:
@@ -277,13 +301,3 @@ def _unpacked(node: h5py.Dataset, values: np.ndarray, dataset: str, source: str)
     except ValueError as fault:
         raise RecordingError(source, dataset, f"its attribute units: {fault}") from fault
     return values if unit == 1 else values * unit
-
-
-def _check_integers(values: np.ndarray, dataset: str, kind: type, source: str) -> None:
-    """Refuse what a conversion to a narrower type would change without a word."""
-    lower, upper = (0, 1) if kind is np.bool_ else (np.iinfo(kind).min, np.iinfo(kind).max)
-    if values.size and not ((values >= lower) & (values <= upper)).all():
-        meaning = "0 and 1 only" if kind is np.bool_ else f"integers from {lower} to {upper}"
-        raise RecordingError(source, dataset, f"must hold {meaning}, not {values.min()} to {values.max()}")
-    if values.dtype.kind == "f" and (values != np.rint(values)).any():
-        raise RecordingError(source, dataset, "must hold integers")

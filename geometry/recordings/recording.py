@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from geometry.grids.grid import Grid
+from geometry.surfaces.integers import narrowed
 from geometry.surfaces.surface import Surface
 
 from .errors import RecordingError
@@ -27,6 +28,7 @@ LAYOUT: tuple[tuple[str, str, type], ...] = (
     ("weight", "/weight", np.float32),
     ("sigma", "/sigma", np.float32),
     ("uncovered", "/uncovered", np.int64),
+    ("quality", "/quality", np.uint8),
     ("beam", "/beam", np.float32),
     ("pressure", "/pressure", np.float32),
     ("wall.vertices", "/wall/vertices", np.float64),
@@ -104,6 +106,7 @@ class Recording:
         weight: (T, *shape), confidence in [0, 1]; the velocity may be NaN where it is 0.
         sigma: (T, D, *shape), m/s, standard deviation of each component.
         uncovered: (T,), nodes inside the mask for which a method has no value.
+        quality: (T, *shape), codes of `Quality`: why an analysis is what it is at each node.
         beam: (T, D, *shape) or (D, *shape), unit vectors along which alone the velocity was measured.
         pressure: (T, *shape), Pa, gauge.
         valve_intervals: (n, 3), rows (region, opens, closes), s.
@@ -130,6 +133,7 @@ class Recording:
     weight: np.ndarray | None = None
     sigma: np.ndarray | None = None
     uncovered: np.ndarray | None = None
+    quality: np.ndarray | None = None
     beam: np.ndarray | None = None
     pressure: np.ndarray | None = None
     valve_intervals: np.ndarray | None = None
@@ -219,15 +223,17 @@ class Recording:
         *,
         sigma: np.ndarray | None = None,
         uncovered: np.ndarray | None = None,
+        quality: np.ndarray | None = None,
         description: str | None = None,
     ) -> Recording:
         """Another velocity (T, D, *shape), m/s, between the same walls: an analysis or a forecast.
 
-        What belonged to the old velocity (weight, sigma, beam, pressure, fluxes) is dropped.
+        What belonged to the old velocity (weight, sigma, quality, beam, pressure, fluxes) is dropped.
         """
         gone: dict[str, Any] = dict.fromkeys(("weight", "beam", "pressure", "flux_mitral", "flux_aortic"))
         text = self.description if description is None else description
-        return replace(self, velocity=velocity, sigma=sigma, uncovered=uncovered, description=text, fluxes=(), **gone)
+        new: dict[str, Any] = {"velocity": velocity, "sigma": sigma, "uncovered": uncovered, "quality": quality}
+        return replace(self, **new, description=text, fluxes=(), **gone)
 
     def valve_intervals_or_derived(self) -> np.ndarray:
         """Rows (region, opens, closes), `(n, 3)`, s: `/valve/intervals`, or else derived from `/valve_open`.
@@ -253,10 +259,15 @@ class Recording:
 def _coerce(instance: Wall | Recording, prefix: str) -> None:
     """Bring every array to its type; a recording keeps no reference to lists or other array types."""
     kinds = {name.removeprefix(prefix): kind for name, _, kind in LAYOUT if name.startswith(prefix)}
+    datasets = {name.removeprefix(prefix): dataset for name, dataset, _ in LAYOUT if name.startswith(prefix)}
     for item in fields(instance):
         value = getattr(instance, item.name)
         if item.name in kinds and value is not None:
-            object.__setattr__(instance, item.name, np.asarray(value, dtype=kinds[item.name]))
+            try:
+                array = narrowed(value, kinds[item.name])
+            except ValueError as fault:
+                raise RecordingError("recording", datasets[item.name], str(fault)) from fault
+            object.__setattr__(instance, item.name, array)
 
 
 def _check_shapes(recording: Recording) -> None:
@@ -281,6 +292,7 @@ def _allowed_shapes(recording: Recording) -> dict[str, tuple[tuple[int, ...], ..
         "/weight": ((frames, *shape),),
         "/sigma": ((frames, dimension, *shape),),
         "/uncovered": ((frames,),),
+        "/quality": ((frames, *shape),),
         "/beam": ((frames, dimension, *shape), (dimension, *shape)),
         "/pressure": ((frames, *shape),),
         **({} if recording.wall is None else _allowed_wall_shapes(recording.wall, frames, dimension)),

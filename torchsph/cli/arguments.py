@@ -19,6 +19,13 @@ OUT = "torchsph-out"
 class Parser(argparse.ArgumentParser):
     """An argument parser whose complaint is one line; the usage is behind `--help`."""
 
+    def parse_known_args(self, args=None, namespace=None):  # type: ignore[no-untyped-def]
+        """Refuse "--option=--", which argparse of Python 3.11 takes for no value at all."""
+        for word in args or ():
+            if isinstance(word, str) and word.startswith("--") and word.endswith("=--"):
+                self.error(f"argument {word[:-3]}: '--' is no value")
+        return super().parse_known_args(args, namespace)
+
     def error(self, message: str) -> NoReturn:
         """Leave with code 2 and one line."""
         self.exit(2, f"{self.prog}: error: {' '.join(message.split())} (see {self.prog} --help)\n")

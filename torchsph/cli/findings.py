@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import sys
-
 import geometry
+
+from .running.notes import LOGGER
 
 
 def tell_findings(recording: geometry.Recording, source: str, *, strict: bool = False) -> None:
@@ -12,4 +12,4 @@ def tell_findings(recording: geometry.Recording, source: str, *, strict: bool = 
     for finding in geometry.findings(recording):
         if strict:
             raise geometry.RecordingError(source, finding.dataset, f"{finding.rule_and_cure} (refused by --strict)")
-        print(f"warning: {finding}", file=sys.stderr)
+        LOGGER.warning("%s", finding)

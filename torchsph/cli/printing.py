@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Sequence
 from typing import Any
 
@@ -11,12 +10,16 @@ import torch
 
 from torchsph import __version__
 
+from .running.notes import LOGGER
 from .terminal import printable
+
+# what the document says by other names, or what is no setting of the run
+_LEFT_OUT = ("run", "measurement", "method", "config", "verbose", "quiet", "json", "status")
 
 
 def run_config(args: argparse.Namespace, **extra: Any) -> dict[str, Any]:
     """What was asked for, with versions, for `metrics.json`; ``extra`` goes over what has its name."""
-    options = {name: value for name, value in vars(args).items() if name not in ("run", "measurement", "method")}
+    options = {name: value for name, value in vars(args).items() if name not in _LEFT_OUT}
     return {"torchsph": __version__, "torch": torch.__version__, **options, **extra}
 
 
@@ -32,4 +35,4 @@ def print_table(rows: Sequence[Sequence[str]], text: bool = False) -> None:
 
 def say(message: str) -> None:
     """A note, on stderr."""
-    print(message, file=sys.stderr)
+    LOGGER.info("%s", message)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import time as clock
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +16,17 @@ from torchsph.simulator.scene import Scene
 from torchsph.simulator.schemes.presets import preset as scheme_preset
 from torchsph.simulator.simulator import Simulator
 
-from .ensemble.assimilate import assimilate
+from .ensemble.assimilate import EnsembleRun, assimilate, default_filter, further
+from .ensemble.identity import ensemble_key
 from .ensemble.options import EnsembleOptions
 from .forecast_skill import ForecastSkill, skill
 from .free_run import run_freely
 from .measurement.prepared import PreparedMeasurement
+from .memory import MemoryPrediction, free_memory, predicted
 from .nudging import filter_sph
+from .runtime import checkpoint
 from .runtime.parallel import from_last, is_last, is_lead
+from .runtime.watching import Watcher
 
 METHODS = ("free", "spline", "sph", "ensemble")
 # Written to analysis.h5 and run when no method is named: the one that wins on a CFD phantom in every case tried. RMS
@@ -44,10 +50,24 @@ class MethodResult:
 
 
 def make_model(
-    recording: geometry.Recording, *, preset: str = "default", spacing: float | None = None, device: str = "cpu"
+    recording: geometry.Recording,
+    *,
+    preset: str = "default",
+    spacing: float | None = None,
+    device: str = "cpu",
+    estimates: geometry.Estimates | None = None,
 ) -> Simulator:
-    """A simulator of the recording's walls and valves; ``spacing`` (m) defaults to the grid's."""
-    return Simulator(Scene.from_recording(recording, spacing), scheme_preset(preset), device=device)
+    """A simulator of the recording's walls and valves.
+
+    Args:
+        recording: whose walls, valves and fluid they are.
+        preset: name of the scheme.
+        spacing: of the particles, m; None: the grid's.
+        device: where particles live.
+        estimates: what ``geometry.estimated`` found of the recording, where that is known already.
+    """
+    scene = Scene.from_recording(recording, spacing, estimates=estimates)
+    return Simulator(scene, scheme_preset(preset), device=device)
 
 
 def make_smoother(preset: str) -> regularize.Smoother:
@@ -65,8 +85,10 @@ def run_methods(
     also: Sequence[geometry.Recording] = (),
     truth: geometry.Recording | None = None,
     lag: int | None = None,
+    minimum_members: int | None = None,
     checkpoints: str | Path | None = None,
     resume: bool = False,
+    watcher: Watcher | None = None,
     seed: int = 0,
     device: str = "cpu",
     progress: bool = False,
@@ -75,50 +97,150 @@ def run_methods(
 
     "free", the run without data, comes along with every method that simulates. ``spacing`` (m) of the particles
     defaults to ``ANALYSIS_SPACING`` grid spacings, half of it in the ensemble's control run; ``members`` to
-    ``DEFAULT_MEMBERS``. ``also``, ``truth``, ``lag``, ``checkpoints`` and ``resume`` are the ensemble's
-    (``assimilate``, ``EnsembleOptions``); the other methods know one measurement. The seconds of a method include the
-    spline that it starts from only where "spline" itself was not asked for.
+    ``DEFAULT_MEMBERS``. ``also``, ``truth``, ``lag``, ``minimum_members``, ``checkpoints``, ``resume`` and ``watcher``
+    are the ensemble's (``assimilate``, ``EnsembleOptions``); the other methods know one measurement. The seconds of a
+    method include the spline that it starts from only where "spline" itself was not asked for.
 
     Under torchrun all processes share the splines and the ensemble; the first one runs "sph" meanwhile and the last
     one "free". What the first one returns is complete.
 
     Raises:
-        ValueError: an unknown method, or "sph" on a measurement of components alone.
+        ValueError: an unknown method, "sph" on a measurement of components alone, or a checkpoint of another run.
+        NotEnoughMemory: more would be needed than is free.
     """
     _check(methods, measured)
     if not methods:
         return {}
     smoother, timer = make_smoother(preset), _Timer()
     prepared = PreparedMeasurement(measured, smoother, progress=progress)
+    models = _Models(prepared, preset, spacing, device)
+    count = DEFAULT_MEMBERS if members is None else members
+    predicted_memory(prepared, methods, preset, models.spacing, count, also).refuse_beyond(free_memory())
+    ensemble = None
+    if "ensemble" in methods:
+        ensemble = _EnsembleCall(
+            prepared,
+            models,
+            also,
+            members=count,
+            options=EnsembleOptions(lag=lag, minimum_members=minimum_members),
+            truth=truth,
+            checkpoints=None if checkpoints is None else Path(checkpoints),
+            resume=resume,
+            seed=seed,
+        )
+        ensemble.refuse_foreign_checkpoint()
     smoothed = prepared.smoothed  # by all processes together
     found = prepared.splines.estimates.summary()
     mended = {"estimates": found} if found else {}
     results: dict[str, MethodResult] = {}
     if "spline" in methods:
         results["spline"] = timer.result(smoothed, {"smoother": repr(smoother), **mended})
-    spacing = ANALYSIS_SPACING * min(measured.grid.spacing) if spacing is None else spacing
-    model = make_model(measured, preset=preset, spacing=spacing, device=device)
     if is_last() and set(methods) != {"spline"}:
-        results["free"] = timer.result(run_freely(measured, model, smoothed.velocity[0], seed=seed, progress=progress))
+        free = run_freely(measured, models.coarse, smoothed.velocity[0], seed=seed, progress=progress)
+        results["free"] = timer.result(free)
     if is_lead() and "sph" in methods:
-        run = filter_sph(prepared, model, seed=seed, progress=progress)
+        run = filter_sph(prepared, models.coarse, seed=seed, progress=progress)
         results["sph"] = timer.result(run.recording, run.info)
+    if ensemble is not None:
+        done = ensemble.run(watcher, progress)
+        results["ensemble"] = timer.result(done.recording, done.info | mended)
+    return _collected(results)
+
+
+def predicted_memory(
+    prepared: PreparedMeasurement,
+    methods: Sequence[str],
+    preset: str = "default",
+    spacing: float | None = None,
+    members: int = DEFAULT_MEMBERS,
+    also: Sequence[geometry.Recording] = (),
+) -> MemoryPrediction:
+    """What ``run_methods`` with the same options will take."""
+    spacing = ANALYSIS_SPACING * min(prepared.recording.grid.spacing) if spacing is None else spacing
+    simulated = set(methods) - {"spline"}
+    runs = [(spacing, 1)] if simulated else []
     if "ensemble" in methods:
-        ensemble = assimilate(
-            prepared,
-            make_model(measured, preset=preset, spacing=CONTROL_SHARE * spacing, device=device),
-            coarse=model,
-            members=DEFAULT_MEMBERS if members is None else members,
-            options=EnsembleOptions(lag=lag),
-            also=also,
-            truth=truth,
-            checkpoints=checkpoints,
-            resume=resume,
-            seed=seed,
+        runs = [(spacing, min(members, EnsembleOptions().batch)), (CONTROL_SHARE * spacing, 1)]
+    return predicted(
+        prepared,
+        scheme_preset(preset),
+        spacings=runs,
+        members=members if "ensemble" in methods else 0,
+        further=also,
+    )
+
+
+class _Models:
+    """The simulators of a measurement, each made when it is first asked for."""
+
+    def __init__(self, prepared: PreparedMeasurement, preset: str, spacing: float | None, device: str) -> None:
+        self.prepared, self.preset, self.device = prepared, preset, device
+        self.spacing = ANALYSIS_SPACING * min(prepared.recording.grid.spacing) if spacing is None else spacing
+
+    @cached_property
+    def coarse(self) -> Simulator:
+        """Of single runs and of the ensemble's members."""
+        return self._at(self.spacing)
+
+    @cached_property
+    def fine(self) -> Simulator:
+        """Of the ensemble's control."""
+        return self._at(CONTROL_SHARE * self.spacing)
+
+    def _at(self, spacing: float) -> Simulator:
+        found = self.prepared.splines.estimates
+        return make_model(
+            self.prepared.recording, preset=self.preset, spacing=spacing, device=self.device, estimates=found
+        )
+
+
+@dataclass(frozen=True)
+class _EnsembleCall:
+    """An ensemble's run with all that it is to be told, before anything is computed."""
+
+    prepared: PreparedMeasurement
+    models: _Models
+    also: Sequence[geometry.Recording]
+    members: int
+    options: EnsembleOptions
+    truth: geometry.Recording | None
+    checkpoints: Path | None
+    resume: bool
+    seed: int
+
+    def refuse_foreign_checkpoint(self) -> None:
+        """Tell another run's checkpoint before splines and free runs have taken their minutes."""
+        if not self.resume or self.checkpoints is None or not is_lead() or not os.path.lexists(self.checkpoints):
+            return
+        key = ensemble_key(
+            [self.prepared, *(further(one, self.prepared) for one in self.also)],
+            self.models.fine,
+            self.models.coarse,
+            default_filter(self.prepared.recording, self.options),
+            self.options,
+            members=self.members,
+            seed=self.seed,
+            truth=self.truth,
+        )
+        checkpoint.refuse_foreign(self.checkpoints, key)
+
+    def run(self, watcher: Watcher | None, progress: bool) -> EnsembleRun:
+        """The ensemble's analyses."""
+        return assimilate(
+            self.prepared,
+            self.models.fine,
+            coarse=self.models.coarse,
+            members=self.members,
+            options=self.options,
+            also=self.also,
+            truth=self.truth,
+            checkpoints=self.checkpoints,
+            resume=self.resume,
+            watcher=watcher,
+            seed=self.seed,
             progress=progress,
         )
-        results["ensemble"] = timer.result(ensemble.recording, ensemble.info | mended)
-    return _collected(results)
 
 
 def _check(methods: Sequence[str], measured: geometry.Recording) -> None:

@@ -8,11 +8,12 @@ from torch import Tensor
 from torchsph.pairs.interface import Backend
 
 from .domain import Domain
-from .failures import broken_members, freeze_members, without_lost
+from .failures import broken_members, check_volume, freeze_members, without_lost
 from .population import Population
 from .rollback import RollbackStates
 from .spatial_sort import SpatialSort
-from .state.neighbour_list import PairSearch
+from .state.checks import check_arrays, check_members, check_time
+from .state.neighbour_list import PairSearch, rows_carried
 from .state.particles import Particles, frozen, rows_frozen
 from .state.record import Record
 from .stepping.coefficients import Coefficients, Parameters
@@ -71,6 +72,8 @@ class AdvancingRun:
             self._stepper.prescribed_kinds = self._pressures.kinds
         self._acceleration = torch.zeros_like(particles.position)
         self._began_at = self._imposed_at = self.time
+        holds = scene.valves and domain.walls is not None and scheme.valve is not None
+        self._filled = domain.filling(particles, self.time) if holds else None
         self._spatial = SpatialSort(search)
 
     @property
@@ -83,10 +86,15 @@ class AdvancingRun:
 
         Raises:
             NumericalFailure: no member is left; a member that fails before is frozen and flagged.
-            ValueError: ``until`` lies in the past.
+            ValueError: ``until`` is not finite, lies in the past or where the wall's motion is not known; or somebody
+                has put in particles whose arrays disagree.
         """
+        until = check_time(until, "the time to advance to")
+        check_arrays(self.particles, self.domain.scene.dimension, self.domain.dtype, self.domain.device)
+        check_members(self.particles)
         if until < self.time:
             raise ValueError(f"cannot advance backwards, from {self.time} s to {until} s")
+        self.domain.check_known(until)
         if until == self.time:
             return
         self.particles = without_lost(self.particles, self.record, self.time)
@@ -94,16 +102,16 @@ class AdvancingRun:
         longest = self._longest_step(until)
         for stop in self.domain.breaks(self.time, until):
             self.surroundings.enter(self.time, stop, valve_strength=self.parameters.valve_strength)
-            self.particles = self.surroundings.prepare(self.particles)
-            self._forget_pairs()
+            self._renumbered(self.surroundings.prepare(self.particles))
             self._advance_interval(stop, longest)
             self.time = stop
-            self.particles = self.surroundings.finish(self.particles, self.record, stop, self._stepper.pressure)
-            self._forget_pairs()
+            self._renumbered(self.surroundings.finish(self.particles, self.record, stop, self._stepper.pressure))
         self.particles, self._acceleration = self._spatial.end(self.particles, self._acceleration)
         self.record.searches = self._stepper.pair_search.searches
         self.record.overflows = self._backend.overflows
         self.surroundings.account(self.particles, self.record, self.time, self._began_at)
+        if self._filled is not None:
+            check_volume(self.record, self._filled, self.time)
 
     def _longest_step(self, until: float) -> float:
         """Limit of the steps to time ``until`` (s) that the scheme names outright, internal."""
@@ -160,12 +168,13 @@ class AdvancingRun:
 
         Particles that have crossed an open valve change sides in every step: the flow must not feel the search.
         """
-        self.particles, renumbered = self.surroundings.exchange(self.particles, self.record, self._stepper.pressure)
+        particles, renumbered = self.surroundings.exchange(self.particles, self.record, self._stepper.pressure)
         if self._population is not None:
-            self.particles, changed = self._population.controlled_when_due(self.particles, active)
+            particles, changed = self._population.controlled_when_due(particles, active)
             renumbered |= changed
         if renumbered:
-            self._forget_pairs()
+            self._acceleration = rows_carried(self.particles, particles, self._acceleration)
+        self.particles = particles
         if self._pressures is not None:
             self.particles = self._pressures.driven(self.particles, self.surroundings.clock, self._stepper)
         self.particles, self._acceleration = self._spatial.when_due(self.particles, self._acceleration)
@@ -213,6 +222,12 @@ class AdvancingRun:
             self.particles = frozen(broken, before, self.particles)
         freeze_members(broken, self.record, self.time)
         return done
+
+    def _renumbered(self, particles: Particles) -> None:
+        """Go on with these particles, of which any may be new or gone."""
+        self._acceleration = rows_carried(self.particles, particles, self._acceleration)
+        self.particles = particles
+        self._stepper.pair_search.forget()
 
     def _forget_pairs(self) -> None:
         self._stepper.pair_search.forget()

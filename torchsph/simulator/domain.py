@@ -110,6 +110,15 @@ class Domain:
                 volume *= length / (vertices[:, axis].max() - vertices[:, axis].min())
         return volume
 
+    def check_known(self, time: float) -> None:
+        """Refuse a time (s) at which nobody knows where the wall is.
+
+        Raises:
+            ValueError: it lies off the key frames of a motion without a period.
+        """
+        if self.scene.walls is not None:
+            self.scene.walls.locate(time)
+
     def filling(self, particles: Particles, time: float) -> Tensor:
         """Volume of the particles inside over that of the walls, or of the periodic box, (members,) float64.
 

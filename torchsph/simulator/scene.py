@@ -15,6 +15,10 @@ import geometry
 _FOREVER = 1e12
 # m^3/s: a measured flux is never exact, however it is stated
 _LEAST_SIGMA = 1e-12
+# labels of faces are bytes
+_MOST_REGION = 255
+# openings and closings of a valve in one stretch of time: more are a slip in its period
+_MOST_BEATS = 100_000
 
 
 @dataclass(frozen=True)
@@ -25,10 +29,10 @@ class Fluid:
     viscosity: float = 0.004
 
     def __post_init__(self) -> None:
-        if not self.density > 0:
-            raise ValueError(f"Fluid.density must be positive (kg/m^3), got {self.density}")
-        if not self.viscosity >= 0:
-            raise ValueError(f"Fluid.viscosity must not be negative (Pa s), got {self.viscosity}")
+        if not 0 < self.density < math.inf:
+            raise ValueError(f"Fluid.density must be positive and finite (kg/m^3), got {self.density}")
+        if not 0 <= self.viscosity < math.inf:
+            raise ValueError(f"Fluid.viscosity must be finite and not negative (Pa s), got {self.viscosity}")
 
     @property
     def kinematic_viscosity(self) -> float:
@@ -71,8 +75,10 @@ class Valve:
     leak: float | None = None
 
     def __post_init__(self) -> None:
-        if self.region < 1:
-            raise ValueError(f"Valve.region must be at least 1 (0 labels the wall), got {self.region}")
+        if self.region != int(self.region) or not 1 <= self.region <= _MOST_REGION:
+            raise ValueError(
+                f"Valve.region must be a whole number from 1 (0 labels the wall) to {_MOST_REGION}, got {self.region}"
+            )
         for opening, closing in self.intervals:
             if not closing > opening:
                 raise ValueError(f"valve of region {self.region}: closes at {closing} s before it opens at {opening} s")
@@ -163,6 +169,11 @@ class Valve:
         times = [t for interval in self.intervals for t in interval]
         if not self.period or not times:
             return [t for t in times if start <= t <= stop]
+        if (stop - start) / self.period > _MOST_BEATS:
+            raise ValueError(
+                f"valve of region {self.region}: its period of {self.period:g} s fits more than {_MOST_BEATS} times "
+                f"into {start:g} to {stop:g} s; give all of them in seconds"
+            )
         found: set[float] = set()
         for t in (*times, *self._covered):
             beats = range(math.ceil((start - t) / self.period), math.floor((stop - t) / self.period) + 1)
@@ -204,12 +215,12 @@ class Scene:
     dimension: int = 3
 
     def __post_init__(self) -> None:
-        if not self.spacing > 0:
-            raise ValueError(f"Scene.spacing must be positive (m), got {self.spacing}")
+        if not 0 < self.spacing < math.inf:
+            raise ValueError(f"Scene.spacing must be positive and finite (m), got {self.spacing}")
         if self.dimension not in (2, 3):
             raise ValueError(f"Scene.dimension must be 2 or 3, got {self.dimension}")
-        if not self.reference_speed > 0:
-            raise ValueError(f"Scene.reference_speed must be positive (m/s), got {self.reference_speed}")
+        if not 0 < self.reference_speed < math.inf:
+            raise ValueError(f"Scene.reference_speed must be positive and finite (m/s), got {self.reference_speed}")
         exact = [valve.flux is not None and not valve.flux_sigma for valve in self.valves]
         if self.valves and all(exact):
             raise ValueError(
@@ -221,6 +232,27 @@ class Scene:
             value = getattr(self, name)
             if value is not None and not callable(value) and len(value) != self.dimension:
                 raise ValueError(f"Scene.{name} needs {self.dimension} entries, got {len(value)}")
+        if self.gravity is not None and not callable(self.gravity) and not all(map(math.isfinite, self.gravity)):
+            raise ValueError(f"Scene.gravity must be finite (m/s^2), got {self.gravity}")
+        if not all(length is None or 0 < length < math.inf for length in self.period or ()):
+            raise ValueError(f"Scene.period must be positive and finite (m), or None along an axis, got {self.period}")
+        self._check_walls()
+
+    def _check_walls(self) -> None:
+        """Raise ValueError where walls have another dimension, or a valve no faces of them, or faces of another's."""
+        if self.walls is None:
+            return
+        if self.walls.dimension != self.dimension:
+            raise ValueError(f"Scene.dimension is {self.dimension}, but its walls have {self.walls.dimension}")
+        regions, present = [valve.region for valve in self.valves], set(np.unique(self.walls.region).tolist())
+        missing = sorted(set(regions) - present)
+        if missing:
+            raise ValueError(
+                f"the valve of region {missing[0]} has no face in the walls, whose regions are {sorted(present)}; "
+                "label the faces of its orifice, or leave the valve out"
+            )
+        if len(set(regions)) < len(regions):
+            raise ValueError(f"two valves have the same region: {sorted(regions)}; give one of them all intervals")
 
     def gravity_at(self, time: float) -> tuple[float, ...]:
         """The body force per mass (D,), m/s^2, at ``time`` (s).
@@ -238,16 +270,23 @@ class Scene:
         return value
 
     @classmethod
-    def from_recording(cls, recording: geometry.Recording, spacing: float | None = None) -> Scene:
+    def from_recording(
+        cls,
+        recording: geometry.Recording,
+        spacing: float | None = None,
+        *,
+        estimates: geometry.Estimates | None = None,
+    ) -> Scene:
         """The fluid, the moving walls and the valves of a recording: only what it has.
 
         ``spacing`` defaults to the smallest grid spacing. The reference speed is 1 m/s, typical of the heart, so that
         the same scene results from a noisy and from a clean recording. Walls that flicker are estimated, and valve
-        times that the recording lacks or cannot mean (``geometry.estimated``). A flux that the recording has measured
-        is that of its valve, with its error; ``/valve/leak`` is the valve's leak.
+        times that the recording lacks or cannot mean (``geometry.estimated``), unless ``estimates`` holds them already.
+        A flux that the recording has measured is that of its valve, with its error; ``/valve/leak`` is the valve's
+        leak.
         """
         recording.wall_for("the simulator")
-        recording = geometry.estimated(recording).recording
+        recording = (geometry.estimated(recording) if estimates is None else estimates).recording
         intervals = recording.valve_intervals_or_derived()
         regions: dict[int, list[tuple[float, float]]] = {}
         span = (float(recording.time[0]), max(float(recording.time[-1]), float(recording.time[0]) + recording.period))

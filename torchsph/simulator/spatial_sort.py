@@ -8,12 +8,14 @@ from torch import Tensor
 from .state.neighbour_list import PairSearch
 from .state.particles import Particles
 
-# from so many particles on they are sorted in space, every so many searches: smaller sets fit into the caches anyway
+# members of so many particles are sorted in space, every so many searches: smaller sets fit into the caches anyway
 _SORT_FROM, _SORT_EVERY = 50_000, 8
 
 
 class SpatialSort:
     """Sorts the particles of a run while it advances, and puts them back into the caller's order afterwards.
+
+    Each member is sorted or not for itself: in which order its sums run depends on nobody else.
 
     Attributes:
         order: (N,) int64, of the particles in space when they were last sorted, or None.
@@ -22,21 +24,36 @@ class SpatialSort:
     def __init__(self, search: PairSearch) -> None:
         self._search = search
         self.order: Tensor | None = None
-        self._sort_at = 0  # number of searches at which they are sorted again
+        self._sort_at: Tensor | None = None  # (members,) number of searches at which they are sorted again
 
     def begin(self, particles: Particles, acceleration: Tensor) -> tuple[Particles, Tensor]:
         """Particles and their accelerations (N, D) in the order of the last time, where there are many."""
-        if particles.count < _SORT_FROM:
+        if particles.count < _SORT_FROM or not bool(_large(particles).any()):
             return particles, acceleration
         return self._sorted(particles.labelled(), acceleration, self.order)
 
     def when_due(self, particles: Particles, acceleration: Tensor) -> tuple[Particles, Tensor]:
         """The same sorted anew now and then, where the neighbours are to be searched anyway."""
-        due = particles.count >= _SORT_FROM and self._search.searches >= self._sort_at
-        if due and self._search.stale(particles):
-            particles, acceleration = self._sorted(particles, acceleration, self._search.spatial_order(particles))
-            self._sort_at = self._search.searches + _SORT_EVERY
+        if particles.count < _SORT_FROM:
+            return particles, acceleration
+        due = _large(particles)
+        if not bool(due.any()):
+            return particles, acceleration
+        if self._sort_at is not None and self._search.renewed is not None:
+            due &= self._search.renewed >= self._sort_at
+        due &= self._search.stale(particles)
+        if bool(due.any()):
+            order = self._search.spatial_order(particles)
+            particles, acceleration = self._sorted(particles, acceleration, _of_members(due, particles, order))
+            self._schedule(due)
         return particles, acceleration
+
+    def _schedule(self, sorted_now: Tensor) -> None:
+        renewed = self._search.renewed
+        if renewed is None:
+            return
+        earlier = torch.zeros_like(renewed) if self._sort_at is None else self._sort_at
+        self._sort_at = torch.where(sorted_now, renewed + _SORT_EVERY, earlier)
 
     def _sorted(self, particles: Particles, acceleration: Tensor, order: Tensor | None) -> tuple[Particles, Tensor]:
         """In an order (N,), with labels that tell the caller's; unchanged where it does not fit."""
@@ -54,3 +71,19 @@ class SpatialSort:
         back = torch.argsort(particles.label, stable=True)
         self.order = torch.argsort(back)
         return particles.by_label(), acceleration[back]
+
+
+def _large(particles: Particles) -> Tensor:
+    """(members,) bool: who has enough particles to be sorted."""
+    return torch.bincount(particles.member, minlength=particles.members) >= _SORT_FROM
+
+
+def _of_members(members: Tensor, particles: Particles, order: Tensor | None) -> Tensor | None:
+    """The order (N,) for the particles of ``members`` (members,) bool; the others keep theirs, member by member."""
+    if order is None or bool(members.all()):
+        return order
+    rank = torch.empty_like(order)
+    rank[order] = torch.arange(len(order), device=order.device)
+    key = torch.where(members[particles.member], rank, torch.arange(len(order), device=order.device))
+    found = torch.argsort(key)
+    return found[torch.argsort(particles.member[found], stable=True)]

@@ -7,8 +7,10 @@
 #include <algorithm>
 #include <cstdint>
 #include <cstring>
+#include <optional>
 #include <vector>
 
+#include "guard.hpp"
 #include "processor.hpp"
 
 #ifdef _OPENMP
@@ -301,6 +303,80 @@ PullCell pull_cell_for(const SplineGrid& g) {
   return pull_cell<Sizes<0, 0, 0>>;
 }
 
+// Sum all blocks' rows into the lower band (nodes * components, width). Cells come in slabs (slab_start, slabs
+// + 1) along the slowest axis; slabs two apart share no coefficient, so even and odd ones take turns.
+void gram(const SplineGrid* grid, const SplineRows* blocks, int32_t block_count, const int64_t* slab_start,
+          int64_t slabs, double* band, int64_t width) {
+  const SplineGrid& g = *grid;
+  const int local = local_size(g);
+  guard::Rescue rescue;
+  for (int parity = 0; parity < 2; ++parity) {
+#pragma omp parallel if (g.cells > kWorthThreads / 16)
+    {
+      std::optional<CellGram> room;
+      const bool ready = rescue.run([&] { room.emplace(g.components, g.padded); });
+#pragma omp for schedule(dynamic, 1)
+      for (int64_t slab = parity; slab < slabs; slab += 2) {
+        for (int64_t number = slab_start[slab]; ready && number < slab_start[slab + 1]; ++number) {
+          CellGram& cell = *room;
+          cell.clear();
+          for (int32_t b = 0; b < block_count; ++b) {
+            const SplineRows& rows = blocks[b];
+            if (rows.kind >= kCellScalar) {
+              if (rows.start[number + 1] > rows.start[number]) add_constant(g, rows, local, cell);
+            } else {
+              add_point_rows(g, rows, rows.start[number], rows.start[number + 1], cell);
+            }
+          }
+          scatter(g, number, local, cell, band, width);
+        }
+      }
+    }
+  }
+  rescue.rethrow();
+}
+
+// out (nodes, C) += rows' (target - rows x), the rows of one block. target in the caller's order, of which number[n] is
+// row n's place; null: zero. x (nodes, C); null: zero. Slabs as in gram: they take turns, so that every
+// coefficient's sum has one order, whatever the number of threads and whichever comes first.
+void gradient(const SplineGrid* grid, const SplineRows* rows, const int64_t* slab_start, int64_t slabs,
+              const double* target, const int64_t* number, const double* x, double* out) {
+  const SplineGrid& g = *grid;
+  const int local = local_size(g);
+  const size_t size = size_t(local) * g.components;
+  const PullCell pull = pull_cell_for(g);
+  guard::Rescue rescue;
+  for (int parity = 0; parity < 2; ++parity) {
+#pragma omp parallel if (rows->count > kWorthThreads)
+    {
+      std::vector<double> row, near, pulled;
+      const bool ready = rescue.run([&] { row.resize(size), near.resize(size), pulled.resize(size); });
+#pragma omp for schedule(dynamic, 1)
+      for (int64_t slab = parity; slab < slabs; slab += 2) {
+        for (int64_t cell = slab_start[slab]; ready && cell < slab_start[slab + 1]; ++cell) {
+          if (rows->start[cell] == rows->start[cell + 1]) continue;
+          const int32_t* position = g.position + cell * local;
+          if (x) gather(g, position, local, x, near.data());
+          std::fill(pulled.begin(), pulled.end(), 0.0);
+          pull(g, *rows, cell, target, number, x ? near.data() : nullptr, row.data(), pulled.data());
+          scatter_add(g, position, local, pulled.data(), out);
+        }
+      }
+    }
+  }
+  rescue.rethrow();
+}
+
+// Counting sort: number[place] is the row at each place when rows are sorted by their slot, equal ones in their order;
+// start (slots + 1) the first place of each slot.
+void sort(const int64_t* slot, int64_t count, int64_t slots, int64_t* number, int64_t* start) {
+  std::fill_n(start, slots + 1, 0);
+  for (int64_t n = 0; n < count; ++n) ++start[slot[n] + 1];
+  for (int64_t s = 0; s < slots; ++s) start[s + 1] += start[s];
+  std::vector<int64_t> next(start, start + slots);
+  for (int64_t n = 0; n < count; ++n) number[next[slot[n]]++] = n;
+}
+
 }  // namespace
 
 extern "C" {
@@ -317,71 +393,20 @@ void spline_set_threads(int32_t threads) {
 #endif
 }
 
-// Sum all blocks' rows into the lower band (nodes * components, width). Cells come in slabs (slab_start, slabs
-// + 1) along the slowest axis; slabs two apart share no coefficient, so even and odd ones take turns.
+int32_t spline_fault(char* text, int64_t room) { return guard::read(text, room); }
+
 void spline_gram(const SplineGrid* grid, const SplineRows* blocks, int32_t block_count, const int64_t* slab_start,
                  int64_t slabs, double* band, int64_t width) {
-  const SplineGrid& g = *grid;
-  const int local = local_size(g);
-  for (int parity = 0; parity < 2; ++parity) {
-#pragma omp parallel if (g.cells > kWorthThreads / 16)
-    {
-      CellGram cell(g.components, g.padded);
-#pragma omp for schedule(dynamic, 1)
-      for (int64_t slab = parity; slab < slabs; slab += 2) {
-        for (int64_t number = slab_start[slab]; number < slab_start[slab + 1]; ++number) {
-          cell.clear();
-          for (int32_t b = 0; b < block_count; ++b) {
-            const SplineRows& rows = blocks[b];
-            if (rows.kind >= kCellScalar) {
-              if (rows.start[number + 1] > rows.start[number]) add_constant(g, rows, local, cell);
-            } else {
-              add_point_rows(g, rows, rows.start[number], rows.start[number + 1], cell);
-            }
-          }
-          scatter(g, number, local, cell, band, width);
-        }
-      }
-    }
-  }
+  guard::call([&] { gram(grid, blocks, block_count, slab_start, slabs, band, width); });
 }
 
-// out (nodes, C) += rows' (target - rows x), the rows of one block. target in the caller's order, of which number[n] is
-// row n's place; null: zero. x (nodes, C); null: zero. Slabs as in spline_gram: they take turns, so that every
-// coefficient's sum has one order, whatever the number of threads and whichever comes first.
 void spline_gradient(const SplineGrid* grid, const SplineRows* rows, const int64_t* slab_start, int64_t slabs,
                      const double* target, const int64_t* number, const double* x, double* out) {
-  const SplineGrid& g = *grid;
-  const int local = local_size(g);
-  const size_t size = size_t(local) * g.components;
-  const PullCell pull = pull_cell_for(g);
-  for (int parity = 0; parity < 2; ++parity) {
-#pragma omp parallel if (rows->count > kWorthThreads)
-    {
-      std::vector<double> row(size), near(size), pulled(size);
-#pragma omp for schedule(dynamic, 1)
-      for (int64_t slab = parity; slab < slabs; slab += 2) {
-        for (int64_t cell = slab_start[slab]; cell < slab_start[slab + 1]; ++cell) {
-          if (rows->start[cell] == rows->start[cell + 1]) continue;
-          const int32_t* position = g.position + cell * local;
-          if (x) gather(g, position, local, x, near.data());
-          std::fill(pulled.begin(), pulled.end(), 0.0);
-          pull(g, *rows, cell, target, number, x ? near.data() : nullptr, row.data(), pulled.data());
-          scatter_add(g, position, local, pulled.data(), out);
-        }
-      }
-    }
-  }
+  guard::call([&] { gradient(grid, rows, slab_start, slabs, target, number, x, out); });
 }
 
-// Counting sort: number[place] is the row at each place when rows are sorted by their slot, equal ones in their order;
-// start (slots + 1) the first place of each slot.
 void spline_sort(const int64_t* slot, int64_t count, int64_t slots, int64_t* number, int64_t* start) {
-  std::fill_n(start, slots + 1, 0);
-  for (int64_t n = 0; n < count; ++n) ++start[slot[n] + 1];
-  for (int64_t s = 0; s < slots; ++s) start[s + 1] += start[s];
-  std::vector<int64_t> next(start, start + slots);
-  for (int64_t n = 0; n < count; ++n) number[next[slot[n]]++] = n;
+  guard::call([&] { sort(slot, count, slots, number, start); });
 }
 
 }  // extern "C"

@@ -14,10 +14,13 @@ import numpy as np
 import pytest
 
 import geometry
+import regularize
+import torchsph as torchsph_package
 from torchsph import cli, data
 from torchsph.evaluation import figures as report
 from torchsph.evaluation import metrics
 from torchsph.methods import by_name as pipeline
+from torchsph.methods.runtime.watching import Stopped
 
 QUICK = ("--spacing", "3e-3")
 PACKAGES = Path(geometry.__file__).resolve().parents[1]
@@ -106,6 +109,7 @@ def test_assimilate_writes_what_it_promises(assimilated, files):
         "report.png",
         "filter.png",
         "metrics.json",
+        "config.toml",
     }
     measured = geometry.read_recording(files["measured"])
     for name in (*analyses, "analysis.h5"):
@@ -176,7 +180,7 @@ def test_a_damaged_checkpoint_is_told_before_any_work(files, tmp_path, monkeypat
 def test_forecast(files, tmp_path):
     done = torchsph("forecast", files["truth"], "--leads", "0.01,0.005", *QUICK, "--save", "--out", "out", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    names = {"metrics.json", "forecast.png", "forecast_5ms.h5", "forecast_10ms.h5"}
+    names = {"metrics.json", "config.toml", "forecast.png", "forecast_5ms.h5", "forecast_10ms.h5"}
     assert {path.name for path in (tmp_path / "out").iterdir()} == names
     document = json.loads((tmp_path / "out" / "metrics.json").read_text())
     assert set(document) == {"leads", "seconds", "config"} and set(document["seconds"]) == {
@@ -278,6 +282,12 @@ FAULTS = {
     "output without name": (["smooth", "{measured}", "--out", "."], "is a folder"),
     "output missing": (["smooth", "{measured}"], "--out"),
     "nothing to look at": (["info"], "FILE"),
+    "no value at all": (["assimilate", "{measured}", "--spacing=--"], "--spacing: '--' is no value"),
+    "more alive than there are": (
+        ["assimilate", "{measured}", "--members", "3", "--minimum-members", "4"],
+        "only 3 members",
+    ),
+    "no such settings": (["info", "{truth}", "--config", "gone.toml"], "gone.toml"),
     "unknown command": (["improve"], "invalid choice"),
     "no command": ([], "COMMAND"),
 }
@@ -307,7 +317,11 @@ def test_fault_in_a_process_of_its_own(tmp_path):
     ("error", "code", "told"),
     [
         (RuntimeError("the flow\nblew up"), 1, "RuntimeError: the flow blew up"),
-        (MemoryError(), 1, "out of memory"),
+        (MemoryError(), 3, "out of memory"),
+        (RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried"), 3, "can't allocate"),
+        (torchsph_package.NumericalFailure("all members failed"), 4, "all members failed"),
+        (regularize.NotConverged("the solver"), 4, "the solver"),
+        (Stopped("stopped by SIGTERM"), 75, "stopped by SIGTERM; run it again with --resume"),
         (KeyboardInterrupt(), 130, "interrupted"),
         (PermissionError(13, "Permission denied", "there"), 2, "there: Permission denied"),
     ],

@@ -14,7 +14,8 @@ import torch
 import torchsph
 from geometry import Grid, Recording
 from torchsph import EnsembleOptions
-from torchsph.methods.ensemble.assimilate import _identity
+from torchsph.methods.ensemble.identity import ensemble_key
+from torchsph.methods.measurement.prepared import PreparedMeasurement
 from torchsph.methods.runtime import checkpoint
 
 STATE = {"x": torch.arange(500.0), "list": [1, 2.5, None, "text"]}
@@ -56,7 +57,7 @@ def test_what_is_cut_or_none_is_refused(path: Path) -> None:
             checkpoint.load(path, "key")
     path.unlink()
     path.mkdir()
-    with pytest.raises(ValueError, match=r"checkpoint.pt: is not a file"):
+    with pytest.raises(FileExistsError, match=r"checkpoint.pt: is a folder"):
         checkpoint.refuse_damaged(path)
 
 
@@ -90,27 +91,62 @@ def test_a_planted_link_is_neither_followed_nor_replaced(path: Path) -> None:
     assert victim.read_text() == "somebody's"
 
 
-def test_the_fingerprint_tells_every_part_and_version_apart(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_fingerprint_tells_every_part_and_the_key_every_version_apart(monkeypatch: pytest.MonkeyPatch) -> None:
     parts = ([1.0, "a"], [1.0, "b"], [np.zeros(3)], [np.zeros((3, 1))], [np.zeros(3, np.float32)], ["a", "b"], ["ab"])
-    keys = {checkpoint.fingerprint(one) for one in parts}
+    assert len({checkpoint.fingerprint(one) for one in parts}) == len(parts)
+    key = checkpoint.run_key({"members": [3]})
     monkeypatch.setattr(torchsph, "__version__", "another")
-    assert len(keys) == len(parts) and not keys & {checkpoint.fingerprint(one) for one in parts}
+    assert key != checkpoint.run_key({"members": [3]})
 
 
-def test_all_that_a_recording_says_enters_the_run_s_identity(box_recording: Callable[..., Recording]) -> None:
+def test_a_refusal_says_what_differs(path: Path) -> None:
+    parts = {"measurement": [np.zeros(3)], "members": [3], "seed": [0]}
+    checkpoint.save(path, checkpoint.run_key(parts), STATE)
+    checkpoint.refuse_foreign(path, checkpoint.run_key(parts))
+    for others, told in (({"seed": [1]}, "seed"), ({"members": [4], "seed": [1]}, "members, seed")):
+        for refuse in (checkpoint.refuse_foreign, checkpoint.load):
+            with pytest.raises(ValueError, match=rf"checkpoint.pt: belongs to a run with another {told}; resume with"):
+                refuse(path, checkpoint.run_key(parts | others))
+
+
+def test_somebody_s_file_of_that_name_is_refused(path: Path) -> None:
+    checkpoint.refuse_other_file(path)  # an earlier run's is replaced by a new run
+    checkpoint.refuse_other_file(path.with_name("none.pt"))
+    path.write_text("hours of work")
+    with pytest.raises(ValueError, match=r"checkpoint.pt: is no checkpoint, and would be replaced"):
+        checkpoint.refuse_other_file(path)
+    path.unlink()
+    path.symlink_to(path.with_name("nowhere"))
+    for refuse in (checkpoint.refuse_other_file, checkpoint.refuse_damaged):
+        with pytest.raises(FileExistsError, match="symbolic link"):
+            refuse(path)
+
+
+def test_all_that_enters_a_run_enters_its_key(box_recording: Callable[..., Recording]) -> None:
     measured = box_recording(lambda points, t: 0.1 * np.cos(100 * points + t), nodes=4)
     grid, options = measured.grid, EnsembleOptions()
     model = torchsph.make_model(measured, spacing=3e-3)
 
-    def key(recording: Recording) -> str:
-        return checkpoint.fingerprint(_identity([recording], model, model, None, options, 3, 0))
+    def key(recording: Recording = measured, also=(), with_=model, options=options, members=3, seed=0, **more) -> str:
+        prepared = [PreparedMeasurement(one) for one in (recording, *also)]
+        return ensemble_key(prepared, with_, model, None, options, members=members, seed=seed, **more)
 
-    others = (
+    recordings = (
         {"grid": Grid(tuple(x + 1e-3 for x in grid.origin), grid.spacing, grid.shape)},
-        {"grid": Grid(grid.origin, tuple(1.05 * x for x in grid.spacing), grid.shape)},
         {"rho": 500.0},
         {"mu": 0.04},
         {"period": 0.02},
+        {"velocity": 1.01 * measured.velocity},
     )
-    keys = {key(measured), *(key(replace(measured, **change)) for change in others)}
-    assert len(keys) == 1 + len(others) and key(replace(measured)) in keys
+    scene = replace(model.scene, gravity=(0.0, 0.0, -9.81))
+    others = (
+        *({"recording": replace(measured, **change)} for change in recordings),
+        {"also": (measured,)},
+        {"with_": replace(model, scene=scene)},
+        {"options": EnsembleOptions(memory=3.0)},
+        {"members": 4},
+        {"seed": 1},
+        {"truth": measured},
+    )
+    keys = {key(), *(key(**change) for change in others)}
+    assert len(keys) == 1 + len(others) and key(options=EnsembleOptions(minimum_members=2)) in keys

@@ -10,13 +10,14 @@ import torch.multiprocessing as multiprocessing
 
 import geometry
 import torchsph
-from torchsph import EnsembleOptions, Estimated, PreparedMeasurement, Simulator, assimilate, estimate_error, preset
+from torchsph import EnsembleOptions, Estimated, PreparedMeasurement, Simulator, assimilate, preset
 from torchsph.assimilation import Parameter
 from torchsph.data import sample_measurement, sample_truth
 from torchsph.methods.ensemble.cycle import Cycle
 from torchsph.methods.ensemble.divergence_cleaning import Cleaned
 from torchsph.methods.ensemble.forecaster import Ensemble, Forecaster
-from torchsph.methods.measurement.observation_operator import Measurement
+from torchsph.methods.runtime.watching import FrameDone
+from torchsph.methods.runtime.watching import Stopped as AskedToStop
 from torchsph.simulator.scene import Scene
 
 FRAMES = slice(10, 14)
@@ -74,19 +75,28 @@ class Stopped(RuntimeError):
     pass
 
 
-def test_a_restart_in_the_middle_changes_no_bit(given, plain, tmp_path, monkeypatch):
-    path, step = tmp_path / "checkpoint.pt", Cycle.step
+class StopAfterTwo:
+    """Asks a run to stop when two frames are done, and keeps what it was told."""
 
-    def stopping(self, frame):
-        if frame == 2:
-            raise Stopped
-        step(self, frame)
+    def __init__(self) -> None:
+        self.told: list[FrameDone] = []
 
-    monkeypatch.setattr(Cycle, "step", stopping)
-    with pytest.raises(Stopped):
-        given.run(checkpoints=path)
-    monkeypatch.setattr(Cycle, "step", step)
-    with pytest.raises(ValueError, match="belongs to a run with other"):
+    def begins(self) -> None:
+        assert not self.told
+
+    def frame_done(self, done: FrameDone) -> None:
+        self.told.append(done)
+
+    def asked_to_stop(self) -> bool:
+        return len(self.told) == 2
+
+
+def test_a_restart_in_the_middle_changes_no_bit(given, plain, tmp_path):
+    path, watcher = tmp_path / "checkpoint.pt", StopAfterTwo()
+    with pytest.raises(AskedToStop, match="stopped after frame 2 of 4"):
+        given.run(checkpoints=path, watcher=watcher)
+    assert watcher.told == [FrameDone(frame, 4, alive=3, members=3) for frame in range(2)]
+    with pytest.raises(ValueError, match="belongs to a run with another seed"):
         given.run(checkpoints=path, resume=True, seed=2)
     assert_same(given.run(checkpoints=path, resume=True), plain)
     assert [shock["time"] for shock in plain.info["shocks"]] == given.measured.time[:-1].tolist()
@@ -209,6 +219,24 @@ def test_members_that_fail_are_replaced_and_the_events_recorded(given, monkeypat
     assert run.info["replaced_members"] == 4
 
 
+def test_a_run_ends_where_fewer_members_live_than_asked_for(given, tmp_path, monkeypatch):
+    advance = Forecaster.advance
+
+    def failing(self, ensemble, *where):
+        found = advance(self, ensemble, *where)
+        return replace(found, failed=torch.tensor([True, False, True]))
+
+    monkeypatch.setattr(Forecaster, "advance", failing)
+    options = EnsembleOptions(batch=2, minimum_members=2)
+    with pytest.raises(
+        torchsph.NumericalFailure, match="1 of 3 members lived through the forecast to .*fewer than the 2"
+    ):
+        given.run(options=options, checkpoints=tmp_path / "c.pt")
+    assert (tmp_path / "c.pt").is_file()
+    with pytest.raises(ValueError, match="minimum_members is 4, but there are only 3"):
+        given.run(options=EnsembleOptions(minimum_members=4))
+
+
 def test_an_analysis_whose_divergence_stays_is_counted_and_warned_of(given, monkeypatch):
     def failing(velocity, mask, spacing):
         return Cleaned(velocity, 1.0, False)
@@ -322,11 +350,10 @@ def test_observations_noisier_than_said_are_noticed(given, fine):
 def test_an_observation_that_claims_to_be_exact_is_refused_by_name(given):
     sigma = np.full_like(given.measured.velocity, 0.05)
     sigma[1] = 0.0
-    told = replace(given.measured, sigma=sigma)
-    error = estimate_error(told, given.prepared.splines, given.smoothed)
-    measurement = Measurement(PreparedMeasurement(told, error=error), told.grid)
-    with pytest.raises(ValueError, match="zero or negative, which makes the gain singular"):
-        measurement.see(1)
+    with pytest.raises(
+        geometry.RecordingError, match=r"/sigma: must be positive .* as at frame 1, .* leave /sigma out"
+    ):
+        PreparedMeasurement(replace(given.measured, sigma=sigma))
 
 
 @pytest.mark.slow

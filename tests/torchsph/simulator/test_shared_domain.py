@@ -1,4 +1,4 @@
-"""A simulator owns nothing that runs change: its runs may be stepped in any order."""
+"""What a member's bits do not depend on: the order in which runs are stepped, its batch, the number of threads."""
 
 import numpy as np
 import pytest
@@ -6,14 +6,21 @@ import torch
 
 import geometry
 from torchsph import Scene, Simulator, preset
+from torchsph.simulator import spatial_sort
 
 STEP = 1e-3  # s
 
 
+FILLING = (0.30, 0.306)  # s
+
+
 @pytest.fixture(scope="module")
-def scene():
-    ventricle = geometry.Ventricle()
-    recording = ventricle.recording(np.arange(0.0, 0.4401, 0.01), grid_spacing=3e-3, wall_spacing=3e-3)
+def recording():
+    return geometry.Ventricle().recording(np.arange(0.0, 0.4401, 0.01), grid_spacing=3e-3, wall_spacing=3e-3)
+
+
+@pytest.fixture(scope="module")
+def scene(recording):
     return Scene.from_recording(recording, 3e-3)
 
 
@@ -40,3 +47,50 @@ def test_two_runs_in_turns_give_the_bits_of_each_alone(scene, name):
         assert torch.equal(run.particles.velocity, alone.particles.velocity)
         assert repr(run.record.summary()) == repr(alone.record.summary())
         assert int(run.record.steps) > 2 and not bool(run.record.failed)
+
+
+def filled(scene, recording, name, members):
+    """Runs of some of three members that differ in speed and turbulence, over a stretch of the filling."""
+    draw = np.random.default_rng(0)
+    shape = recording.velocity.shape[1:]
+    noise = draw.normal(0.0, 0.1, (3, *shape)).astype(np.float32)
+    factor = np.array([0.5, 1.0, 2.5], np.float32)[:, None, None, None, None]
+    field = torch.from_numpy((factor * (recording.velocity[30] + noise))[list(members)])
+    run = Simulator(scene, preset(name)).start(FILLING[0], members=len(members), seed=3)
+    run.impose(recording.grid, field, torch.from_numpy(np.array(recording.mask[30])))
+    run.advance(0.5 * sum(FILLING))
+    run.advance(FILLING[1])
+    assert not bool(run.record.failed.any())
+    return run
+
+
+def rows_of(run, member):
+    mine = run.particles.member == member
+    return [getattr(run.particles, name)[mine] for name in ("position", "velocity", "deviation")]
+
+
+@pytest.mark.parametrize(
+    ("name", "sort_from"), [("default", 50_000), ("weakly_compressible", 50_000), ("weakly_compressible", 1)]
+)
+def test_a_member_has_the_bits_it_has_alone(scene, recording, name, sort_from, monkeypatch):
+    """Faster members have their neighbours searched more often, and blood comes in at other moments."""
+    monkeypatch.setattr(spatial_sort, "_SORT_FROM", sort_from)
+    monkeypatch.setattr(spatial_sort, "_SORT_EVERY", 2)
+    batch = filled(scene, recording, name, (0, 1, 2))
+    for member in (0, 2):
+        alone = filled(scene, recording, name, (member,))
+        for together, single in zip(rows_of(batch, member), rows_of(alone, 0), strict=True):
+            assert torch.equal(together, single)
+
+
+@pytest.mark.parametrize("name", ["default", "weakly_compressible"])
+def test_bits_do_not_depend_on_the_number_of_threads(scene, recording, name):
+    before, found = torch.get_num_threads(), []
+    try:
+        for threads in (1, 2):
+            torch.set_num_threads(threads)
+            found.append(filled(scene, recording, name, (0, 2)).particles)
+    finally:
+        torch.set_num_threads(before)
+    for other in found[1:]:
+        assert torch.equal(other.position, found[0].position) and torch.equal(other.velocity, found[0].velocity)

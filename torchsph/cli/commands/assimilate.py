@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import shutil
 from collections.abc import Mapping
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -17,16 +18,21 @@ from torchsph.methods import by_name
 from torchsph.methods.runtime import checkpoint, parallel
 
 from ..arguments import add_model_options, add_output_folder, add_seed, names, whole
-from ..checks import check_spacing, usable_device
+from ..checks import check_spacing, informative, usable_device
 from ..command import Command
 from ..outputs import output_folder, staged, write_json
 from ..printing import print_table, run_config, say
+from ..running.folder_lock import locked
+from ..running.notes import shows_bar
+from ..running.provenance import provenance
+from ..running.settings import config_text
+from ..running.status import RunWatcher, StatusFile
+from ..running.stopping import StopSignals
 
 
 def _arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("measurement", nargs="?", metavar="MEASUREMENT.h5", help="a recording with /weight or /sigma")
     parser.add_argument("--truth", metavar="TRUTH.h5", help="the true flow, to compute errors against")
-    parser.add_argument("--method", type=names, metavar="NAME[,NAME]", help="free, spline, sph, ensemble")
     parser.add_argument(
         "--also",
         action="append",
@@ -34,14 +40,24 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FILE.h5",
         help="a further measurement of the same beat, with its own grid, times and errors (repeatable)",
     )
+    add_method_options(parser)
+    parser.add_argument("--resume", action="store_true", help="go on with the ensemble where DIR/checkpoint.pt left it")
+    add_output_folder(parser)
+    parser.add_argument("--status", metavar="FILE.jsonl", help="append a line for every frame: how far, how long yet")
+
+
+def add_method_options(parser: argparse.ArgumentParser) -> None:
+    """What is run, and how: the options that do not name a file."""
+    parser.add_argument("--method", type=names, metavar="NAME[,NAME]", help="free, spline, sph, ensemble")
     add_model_options(parser)
     parser.add_argument("--members", type=whole(2), metavar="N", help="size of the ensemble")
     parser.add_argument(
         "--lag", type=whole(1), metavar="N", help="frames whose data still move the ensemble's earlier analyses (off)"
     )
-    parser.add_argument("--resume", action="store_true", help="go on with the ensemble where DIR/checkpoint.pt left it")
+    parser.add_argument(
+        "--minimum-members", type=whole(1), metavar="N", help="end the run where fewer live through a forecast (1)"
+    )
     add_seed(parser)
-    add_output_folder(parser)
 
 
 def assimilate(args: argparse.Namespace) -> None:
@@ -50,38 +66,57 @@ def assimilate(args: argparse.Namespace) -> None:
     Under torchrun the processes share the ensemble's simulations; the first one writes and prints.
     """
     measured_path, truth_path, methods = _inputs(args)
-    folder, device = output_folder(args.out), parallel.own_device(usable_device(args.device))
-    measured = geometry.read_recording(measured_path)
-    also = [geometry.read_recording(path) for path in args.also]
-    truth = None if truth_path is None else geometry.read_recording(truth_path)
-    check_spacing(args.spacing, measured)
-    raw = metrics.evaluate(measured, truth, measured)  # first: a truth that does not fit must not cost a run
-    saved = folder / "checkpoint.pt"
-    if args.resume and "ensemble" in methods and parallel.is_lead():
+    files = [f"{name}.h5" for name in methods]
+    folder = output_folder(args.out, [*files, "analysis.h5", "report.png", "filter.png", "metrics.json", "config.toml"])
+    device = parallel.own_device(usable_device(args.device))
+    lead = parallel.is_lead()
+    held = locked(folder) if lead else nullcontext(folder)
+    with held, StatusFile(args.status if lead else None) as status, StopSignals() as signals:
+        account = provenance(args, {"measurement": measured_path, "truth": truth_path, "also": args.also})
+        measured = informative(geometry.read_recording(measured_path), measured_path)
+        also = [informative(geometry.read_recording(path), path) for path in args.also]
+        truth = None if truth_path is None else geometry.read_recording(truth_path)
+        check_spacing(args.spacing, measured)
+        raw = metrics.evaluate(measured, truth, measured)  # first: a truth that does not fit must not cost a run
+        saved = folder / "checkpoint.pt"
+        if "ensemble" in methods and lead:
+            _check_checkpoint(saved, args.resume)
+        with parallel.joined():
+            results = by_name.run_methods(
+                measured,
+                methods,
+                preset=args.preset,
+                spacing=args.spacing,
+                members=args.members,
+                lag=args.lag,
+                minimum_members=args.minimum_members,
+                also=also,
+                truth=truth,
+                checkpoints=saved,
+                resume=args.resume,
+                watcher=RunWatcher(signals, status),
+                seed=args.seed,
+                device=device,
+                progress=lead and shows_bar(args),
+            )
+        if not lead:
+            return
+        signals.waits = True  # what is left are seconds, and all the work is in them
+        chosen = by_name.DEFAULT_METHOD if by_name.DEFAULT_METHOD in methods else methods[0]
+        config = run_config(args, measured=measured_path, truth=truth_path, methods=methods, analysis=chosen)
+        _write(folder, measured, truth, results, raw, config, account, config_text(args))
+        if "ensemble" in methods:
+            saved.unlink(missing_ok=True)  # the run is complete: there is nothing to go on with
+
+
+def _check_checkpoint(saved: Path, resume: bool) -> None:
+    """Refuse, before any work, a checkpoint that cannot be gone on from, and a file that one would replace."""
+    if resume:
         checkpoint.refuse_damaged(saved)
-    with parallel.joined():
-        results = by_name.run_methods(
-            measured,
-            methods,
-            preset=args.preset,
-            spacing=args.spacing,
-            members=args.members,
-            lag=args.lag,
-            also=also,
-            truth=truth,
-            checkpoints=saved,
-            resume=args.resume,
-            seed=args.seed,
-            device=device,
-            progress=parallel.is_lead(),
-        )
-    if not parallel.is_lead():
         return
-    chosen = by_name.DEFAULT_METHOD if by_name.DEFAULT_METHOD in methods else methods[0]
-    config = run_config(args, measured=measured_path, truth=truth_path, methods=methods, analysis=chosen)
-    _write(folder, measured, truth, results, raw, config)
-    if "ensemble" in methods:
-        saved.unlink(missing_ok=True)  # the run is complete: there is nothing to go on with
+    checkpoint.refuse_other_file(saved)
+    if saved.exists():
+        say(f"{saved}: an earlier run was interrupted; this one begins anew and replaces it (--resume goes on with it)")
 
 
 def _write(
@@ -91,6 +126,8 @@ def _write(
     results: Mapping[str, by_name.MethodResult],
     raw: Scores,
     config: dict[str, Any],
+    account: dict[str, Any],
+    settings: str,
 ) -> None:
     """Score, draw and write the results; print what they are worth.
 
@@ -101,21 +138,24 @@ def _write(
         results: of each method.
         raw: the measurement's own scores.
         config: what was asked for.
+        account: where the results come from.
+        settings: all options as a file.
     """
     analyses = {name: result.recording for name, result in results.items()}
     scores = {"raw": raw} | {name: metrics.evaluate(each, truth, measured) for name, each in analyses.items()}
     seconds = {name: result.seconds for name, result in results.items()}
-    config["info"] = {name: result.info for name, result in results.items()}
+    config["info"] = {name: result.info for name, result in results.items()} | {"provenance": account}
     if truth is not None:
         claims = {name: metrics.spread_over_skill(recording, truth) for name, recording in analyses.items()}
         config["spread_over_skill"] = {name: claim.value for name, claim in claims.items() if claim is not None}
     with staged(folder) as scratch:
         for name, recording in analyses.items():
-            geometry.write_recording(scratch / f"{name}.h5", recording)
+            geometry.write_recording(scratch / f"{name}.h5", recording, provenance=account | {"method": name})
         shutil.copyfile(scratch / f"{config['analysis']}.h5", scratch / "analysis.h5")
         figures.draw_report(scratch / "report.png", measured, analyses, scores, truth, seconds)
         if "ensemble" in results:
             filter_figure(results["ensemble"].info["filter"]).savefig(scratch / "filter.png", dpi=110)
+        (scratch / "config.toml").write_text(settings, encoding="utf-8", errors="backslashreplace")
         write_json(scratch / "metrics.json", metrics_document(measured, scores, seconds, config))
     print_table(figures.scores_table(scores, seconds))
     for words in results["ensemble"].info["filter"]["warnings"] if "ensemble" in results else ():
@@ -136,6 +176,9 @@ def _inputs(args: argparse.Namespace) -> tuple[Path, Path | None, tuple[str, ...
         measured, truth = Path(args.measurement), None if args.truth is None else Path(args.truth)
         methods = args.method or (by_name.DEFAULT_METHOD,)
     unknown = [name for name in methods if name not in by_name.METHODS]
+    members = by_name.DEFAULT_MEMBERS if args.members is None else args.members
+    if members < (args.minimum_members or 0):
+        raise ValueError(f"--minimum-members: {args.minimum_members} are to live, but there are only {members} members")
     if unknown:
         raise ValueError(f"--method: unknown {', '.join(unknown)}; known are {', '.join(by_name.METHODS)}")
     return measured, truth, methods

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from dataclasses import fields, replace
+from pathlib import Path
 from typing import Any
 
 import geometry
@@ -13,6 +13,8 @@ from geometry.formats import convert as convert_files
 
 from ..command import Command
 from ..findings import tell_findings
+from ..printing import say
+from ..running.provenance import provenance
 
 STRINGS = {
     "mask": "array that is above a half in the blood",
@@ -72,11 +74,13 @@ def convert(args: argparse.Namespace) -> None:
     result = convert_files(
         args.inputs, said, format=args.format, wall=wall, rho=args.rho, mu=args.mu, description=args.description
     )
-    geometry.write_recording(args.out, result.recording, strict=args.strict)
+    inputs = {"inputs": [name for name in args.inputs if Path(name).is_file()], "wall": args.wall, "map": args.map}
+    account = provenance(args, inputs)
+    geometry.write_recording(args.out, result.recording, strict=args.strict, provenance=account)
     for note in result.notes:
-        print(f"note: {note}", file=sys.stderr)
+        say(f"note: {note}")
     tell_findings(result.recording, args.out)
-    print(f"wrote {result.recording.frames} frames to {args.out}", file=sys.stderr)
+    say(f"wrote {result.recording.frames} frames to {args.out}")
 
 
 def _given(args: argparse.Namespace) -> dict[str, Any]:

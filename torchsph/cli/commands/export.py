@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 
 import geometry
@@ -11,6 +10,7 @@ from geometry.formats import EXPORTS
 from geometry.formats import export as export_files
 
 from ..command import Command
+from ..printing import say
 
 
 def _arguments(parser: argparse.ArgumentParser) -> None:
@@ -25,7 +25,7 @@ def export(args: argparse.Namespace) -> None:
     target = args.out or Path(args.file).with_suffix("")
     written = export_files(recording, target, args.to)
     more = f" and {len(written) - 1} more beside it" if len(written) > 1 else ""
-    print(f"wrote {written[0]}{more}", file=sys.stderr)
+    say(f"wrote {written[0]}{more}")
 
 
 COMMAND = Command("export", "Write a recording for ParaView, 3D Slicer, MATLAB or xarray.", _arguments, export)

@@ -17,6 +17,10 @@ from ..checks import check_spacing, full_vectors, usable_device
 from ..command import Command
 from ..outputs import output_folder, staged, write_json
 from ..printing import print_table, run_config, say
+from ..running.folder_lock import locked
+from ..running.notes import shows_bar
+from ..running.provenance import provenance
+from ..running.settings import config_text
 
 # lead times in s where none are named
 LEADS = (0.005, 0.01, 0.02, 0.04)
@@ -53,14 +57,17 @@ def forecast(args: argparse.Namespace) -> None:
         spacing=args.spacing,
         device=device,
         save=args.save,
-        progress=True,
+        progress=shows_bar(args),
         seed=args.seed,
     )
     config = run_config(args, recording=args.recording, leads=leads) | dict(skill.config)
-    with staged(folder) as scratch:
+    account = provenance(args, {"recording": args.recording})
+    config["info"] = {"provenance": account}
+    with locked(folder), staged(folder) as scratch:
         for lead, saved in skill.recordings.items():
-            geometry.write_recording(scratch / f"forecast_{1e3 * lead:g}ms.h5", saved)
+            geometry.write_recording(scratch / f"forecast_{1e3 * lead:g}ms.h5", saved, provenance=account)
         figures.draw_forecast(scratch / "forecast.png", skill.leads)
+        (scratch / "config.toml").write_text(config_text(args), encoding="utf-8", errors="backslashreplace")
         found = {"leads": skill.leads, "seconds": skill.seconds, "config": config, "failures": skill.failures}
         write_json(scratch / "metrics.json", found)
     rows = [["lead ms", "starts", "model", "persistence"]]

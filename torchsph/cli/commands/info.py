@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, TypedDict
 
 import numpy as np
 import torch
@@ -11,14 +14,32 @@ import torch
 import geometry
 from torchsph.evaluation import metrics
 
+from ..arguments import number
 from ..command import Command
 from ..findings import tell_findings
 from ..printing import print_table
+from ..running.isolated import LEAST_MEMORY, SECONDS_TO_READ, TIMES_SIZE, isolated
+from ..running.notes import LOGGER
+
+
+class Looked(TypedDict):
+    """What is printed of a file."""
+
+    rows: list[list[str]]
+    findings: list[str]
 
 
 def _arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("file", nargs="?", metavar="FILE")
     parser.add_argument("--backends", action="store_true", help="list the pair kernels of this machine")
+    parser.add_argument("--isolated", action="store_true", help="read it in a process of its own, with limits")
+    parser.add_argument(
+        "--seconds",
+        type=number(0, open_below=True),
+        default=SECONDS_TO_READ,
+        metavar="S",
+        help="that --isolated allows (%(default)g)",
+    )
     parser.add_argument("--strict", action="store_true", help="refuse whatever else is odd about the recording")
 
 
@@ -36,10 +57,58 @@ def info(args: argparse.Namespace) -> None:
             for one in available_backends(device)
         ]
         print_table([["backend", "device", "present", "why"], *rows], text=True)
-    if args.file is not None:
-        recording = geometry.read_recording(args.file)
-        print_table(summary_table(recording), text=True)
-        tell_findings(recording, args.file, strict=args.strict)
+    if args.file is None:
+        return
+    if not args.isolated:
+        _show(_looked_at(args.file, args.strict))
+        return
+    memory = LEAST_MEMORY + TIMES_SIZE * Path(args.file).stat().st_size
+    found = isolated(partial(_looked_at, args.file, args.strict), args.file, seconds=args.seconds, memory=memory)
+    _show(found)
+
+
+def _looked_at(file: str, strict: bool) -> Looked:
+    """The summary of a file, and what is odd about it; refused with `strict`."""
+    recording = geometry.read_recording(file)
+    found = [] if strict else [str(finding) for finding in geometry.findings(recording)]
+    if strict:
+        tell_findings(recording, file, strict=True)
+    rows = summary_table(recording)
+    made_by = geometry.read_provenance(file)
+    if made_by is not None:
+        rows.append(["made by", _maker(made_by)])
+    return {"rows": rows + _memory_rows(recording), "findings": found}
+
+
+def _show(found: Looked) -> None:
+    print_table(found["rows"], text=True)
+    for finding in found["findings"]:
+        LOGGER.warning("%s", finding)
+
+
+def _maker(made_by: Mapping[str, Any]) -> str:
+    """Version, commit, command, method and seed of an attribute that may hold anything."""
+    told = [f"torchsph {made_by.get('torchsph', '?')}"]
+    told += [
+        f"{name} {made_by[name]}" for name in ("commit", "command", "method", "seed") if made_by.get(name) is not None
+    ]
+    return ", ".join(told)
+
+
+def _memory_rows(recording: geometry.Recording) -> list[list[str]]:
+    """What the default run would take; nothing for what no method runs on."""
+    from torchsph.methods import by_name  # long imports, which the list of backends has no need of
+    from torchsph.methods.measurement.prepared import PreparedMeasurement
+    from torchsph.methods.memory import free_memory
+
+    try:
+        methods = ("ensemble",) if recording.wall is not None else ("spline",)
+        needed = by_name.predicted_memory(PreparedMeasurement(recording), methods).total
+    except (ValueError, RuntimeError):
+        return []
+    free = free_memory()
+    left = "" if free is None else f", {free / 1e9:.3g} GB are free"
+    return [["memory", f"about {needed / 1e9:.2g} GB for {methods[0]} beside the program's own{left}"]]
 
 
 def summary_table(recording: geometry.Recording) -> list[list[str]]:
@@ -51,6 +120,7 @@ def summary_table(recording: geometry.Recording) -> list[list[str]]:
         "weight",
         "sigma",
         "uncovered",
+        "quality",
         "beam",
         "pressure",
         "volume",

@@ -14,6 +14,8 @@ from ..arguments import add_seed, number, whole
 from ..checks import output_file
 from ..command import Command
 from ..printing import print_table, say
+from ..running.notes import shows_bar
+from ..running.provenance import provenance
 
 # a mode's options and what measures with them; looked up when a mode runs, so that the other commands start without it
 Mode = tuple[type[Any], Callable[..., geometry.Recording]]
@@ -92,8 +94,8 @@ def measure(args: argparse.Namespace) -> None:
     if foreign:
         raise ValueError(f"{', '.join(foreign)}: means nothing with --mode {args.mode}")
     true = geometry.read_recording(args.true)
-    measured = make(true, kind(**given), args.seed, progress=True)
-    geometry.write_recording(path, measured)
+    measured = make(true, kind(**given), args.seed, progress=shows_bar(args))
+    geometry.write_recording(path, measured, provenance=provenance(args, {"true": args.true}))
     if geometry.measurement_type(measured).full:
         print_table(figures.scores_table({"raw": metrics.evaluate(measured, true)}, {}))
     say(f"wrote {len(measured.time)} frames to {path}")

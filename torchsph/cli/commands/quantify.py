@@ -20,6 +20,9 @@ from torchsph.haemodynamics.quantities import UNITS, FlowDomain, flow_quantities
 from ..arguments import add_output_folder
 from ..command import Command
 from ..outputs import output_folder, staged, write_json
+from ..running.folder_lock import locked
+from ..running.provenance import provenance
+from ..running.settings import config_text
 
 Curves = dict[str, NDArray[np.float64]]
 
@@ -51,10 +54,16 @@ def quantify(args: argparse.Namespace) -> None:
         "curves": fields,
         "beat": numbers,
         "caution": CAUTION,
-        "config": {"torchsph": __version__, "analysis": args.analysis, "truth": args.truth},
+        "config": {
+            "torchsph": __version__,
+            "analysis": args.analysis,
+            "truth": args.truth,
+            "info": {"provenance": provenance(args, {"analysis": args.analysis, "truth": args.truth})},
+        },
     }
-    with staged(folder) as scratch:
+    with locked(folder), staged(folder) as scratch:
         write_json(scratch / "quantities.json", document)
+        (scratch / "config.toml").write_text(config_text(args), encoding="utf-8", errors="backslashreplace")
         _write_csv(scratch / "quantities.csv", recording.time, fields)
     for row in _table(fields, numbers):
         print("  ".join(cell.ljust(34) if n == 0 else cell.rjust(12) for n, cell in enumerate(row)).rstrip())

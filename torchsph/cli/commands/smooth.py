@@ -8,9 +8,11 @@ import geometry
 from torchsph.evaluation import figures, metrics
 from torchsph.methods.measurement.frame_splines import smooth as smooth_recording
 
-from ..checks import full_vectors, output_file
+from ..checks import full_vectors, informative, output_file
 from ..command import Command
 from ..printing import print_table, say
+from ..running.notes import shows_bar
+from ..running.provenance import provenance
 
 
 def _arguments(parser: argparse.ArgumentParser) -> None:
@@ -22,8 +24,9 @@ def smooth(args: argparse.Namespace) -> None:
     """`torchsph smooth`: a B-spline field for each frame."""
     path = output_file(args.out)
     measured = full_vectors(geometry.read_recording(args.measurement), args.measurement)
-    smoothed = smooth_recording(measured, progress=True)
-    geometry.write_recording(path, smoothed)
+    informative(measured, args.measurement, weighed=False)
+    smoothed = smooth_recording(measured, progress=shows_bar(args))
+    geometry.write_recording(path, smoothed, provenance=provenance(args, {"measurement": args.measurement}))
     scores = {name: metrics.evaluate(one, None, measured) for name, one in (("raw", measured), ("spline", smoothed))}
     print_table(figures.scores_table(scores, {}))
     say(f"wrote {len(smoothed.time)} frames to {path}")

@@ -50,9 +50,11 @@ class Analyser:
 
     Attributes:
         last_increments: (J, D, *shape), m/s, of the last analysis, before they were weighted; None without one.
+        reason: (m,) ``Reason`` codes of the last analysis's observations.
     """
 
     last_increments: Tensor | None
+    reason: Tensor
 
     def __init__(
         self,
@@ -210,6 +212,7 @@ class Analyser:
             number = frame_at(self.truth.time, time)
             if number is not None:
                 right = torch.from_numpy(self.truth.velocity[number]).flatten(1)[:, inside].flatten()
+        self.reason = analysis.reason
         self.record.add(
             time,
             analysis,

@@ -28,6 +28,7 @@ class Analyses:
         fields: (D, *shape) for each frame, m/s, freed of divergence.
         sigmas: (D, *shape) for each frame, m/s, what the filter claims.
         missing: nodes for each frame that the forecast did not cover.
+        quality: (*shape) uint8 for each frame, codes of ``geometry.Quality``.
         events: dictionaries with their time, in order.
         shocks: what each forecast's start lost to the projection (``Forecasts.shock``).
     """
@@ -35,25 +36,27 @@ class Analyses:
     fields: list[Tensor]
     sigmas: list[Tensor]
     missing: list[int]
+    quality: list[Tensor]
     events: list[dict[str, Any]]
     shocks: list[float]
 
     def __init__(self, measured: geometry.Recording, lag: int | None) -> None:
         self.measured = measured
         self.lagged = None if lag is None else LaggedAnalyses(lag)
-        self.fields, self.sigmas, self.missing, self.events, self.shocks = [], [], [], [], []
+        self.fields, self.sigmas, self.missing, self.quality, self.events, self.shocks = [], [], [], [], [], []
 
     def happened(self, frame: int, **what: Any) -> None:
         """Note an event at a frame."""
         self.events.append({"time": float(self.measured.time[frame]), **what})
 
-    def add(self, ensemble: Ensemble, control: Tensor, sigma: Tensor, missing: int) -> None:
+    def add(self, ensemble: Ensemble, control: Tensor, sigma: Tensor, quality: Tensor, missing: int) -> None:
         """The next frame's analysis.
 
         Args:
             ensemble: that the next forecast starts from.
             control: (D, *shape), m/s, the estimate, 0 outside the mask.
             sigma: (D, *shape), m/s.
+            quality: (*shape) uint8, codes of ``geometry.Quality``.
             missing: nodes that the forecast did not cover.
         """
         frame = len(self.fields)
@@ -61,6 +64,7 @@ class Analyses:
             self.lagged.add(frame, control, ensemble.members - ensemble.control, sigma)
         self.fields.append(self._clean(control, frame))
         self.sigmas.append(sigma.to(torch.float32))
+        self.quality.append(quality)
         self.missing.append(missing)
 
     def improved(self, analysis: Analysis, inside: Tensor, numbers: int) -> list[Lagged]:
@@ -93,6 +97,7 @@ class Analyses:
             np.stack([field.numpy() for field in self.fields]),
             sigma=np.stack([sigma.numpy() for sigma in self.sigmas]),
             uncovered=np.array(self.missing, np.int64),
+            quality=np.stack([codes.numpy() for codes in self.quality]),
             description=description,
         )
 
@@ -102,6 +107,7 @@ class Analyses:
             "fields": list(self.fields),
             "sigmas": list(self.sigmas),
             "missing": list(self.missing),
+            "quality": list(self.quality),
             "events": list(self.events),
             "shocks": list(self.shocks),
             "lagged": [] if self.lagged is None else self.lagged.state(),
@@ -109,7 +115,7 @@ class Analyses:
 
     def restore(self, state: dict[str, Any]) -> None:
         """Go on from what ``state`` gave."""
-        self.fields, self.sigmas = list(state["fields"]), list(state["sigmas"])
+        self.fields, self.sigmas, self.quality = (list(state[name]) for name in ("fields", "sigmas", "quality"))
         self.missing, self.events, self.shocks = (list(state[name]) for name in ("missing", "events", "shocks"))
         if self.lagged is not None:
             self.lagged.restore(state["lagged"])

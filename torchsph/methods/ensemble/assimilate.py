@@ -22,13 +22,17 @@ from tqdm import tqdm
 import geometry
 from torchsph.assimilation import LETKF, RTPS, Filter, Localisation
 from torchsph.simulator.simulator import Simulator
+from torchsph.simulator.transfer.checks import check_grid
 
 from ..measurement.observation_operator import Measurement
 from ..measurement.prepared import PreparedMeasurement
 from ..runtime import checkpoint
+from ..runtime.parallel import anywhere
+from ..runtime.watching import FrameDone, Stopped, Watcher
 from .accounts import accounts_of
 from .cycle import Cycle
 from .forecaster import Forecaster
+from .identity import ensemble_key
 from .options import EnsembleOptions
 
 
@@ -59,6 +63,7 @@ def assimilate(
     truth: geometry.Recording | None = None,
     checkpoints: str | Path | None = None,
     resume: bool = False,
+    watcher: Watcher | None = None,
     seed: int = 0,
     progress: bool = False,
 ) -> EnsembleRun:
@@ -75,6 +80,7 @@ def assimilate(
         truth: for the scores in the record alone. It never enters an analysis.
         checkpoints: file to which every cycle writes its state.
         resume: go on from it where it is there.
+        watcher: is told of every frame, and may ask the run to stop; in one process or in all of them.
         seed: of everything random. Under ``torch.distributed`` the processes share the simulations; the result is the
             same for any number of them.
         progress: show a bar.
@@ -83,21 +89,30 @@ def assimilate(
         The analyses, with their claimed deviation and the accounts of the run.
 
     Raises:
-        ValueError: fewer than two members, or a checkpoint of another run.
-        NumericalFailure: all simulations failed.
+        ValueError: fewer than two members, a simulator or a truth of another grid than the measurement's, or a
+            checkpoint of another run.
+        NumericalFailure: all simulations failed, or fewer are alive than ``options.minimum_members``.
+        Stopped: the watcher asked for it; the checkpoint holds all frames that were done.
     """
-    if resume and checkpoints is not None:
-        checkpoint.refuse_damaged(Path(checkpoints))
     if members < 2:
         raise ValueError(f"an ensemble needs at least 2 members, got {members}")
     if resume and checkpoints is None:
         raise ValueError("resume needs the file of checkpoints that the run before wrote")
     options = EnsembleOptions() if options is None else options
     coarse = model if coarse is None else coarse
+    given = measured if isinstance(measured, geometry.Recording) else measured.recording
+    for one in (model, coarse):
+        check_grid(given.grid, one.scene.dimension)
+    if truth is not None and truth.grid.shape != given.grid.shape:
+        raise ValueError(f"the truth has a grid of {truth.grid.shape} nodes, the measurement one of {given.grid.shape}")
     first = PreparedMeasurement.of(measured, progress=progress)
-    prepared = [first, *(_further(other, first) for other in also)]
+    prepared = [first, *(further(other, first) for other in also)]
     grid = first.recording.grid
     filter = default_filter(first.recording, options) if filter is None else filter
+    key = ensemble_key(prepared, model, coarse, filter, options, members=members, seed=seed, truth=truth)
+    path = None if checkpoints is None else Path(checkpoints)
+    if resume and path is not None:
+        checkpoint.refuse_foreign(path, key)  # before the splines and error models that the cycle begins with
     cycle = Cycle(
         [Measurement(each, grid, options.kernel) for each in prepared],
         Forecaster(model, coarse, grid, options.transfer, batch=options.batch, seed=seed),
@@ -107,49 +122,34 @@ def assimilate(
         truth=truth,
         seed=seed,
     )
-    recordings = [each.recording for each in prepared]
-    key = checkpoint.fingerprint(_identity(recordings, model, coarse, filter, options, members, seed))
-    path = None if checkpoints is None else Path(checkpoints)
     state = checkpoint.load(path, key) if resume and path is not None else None
     if state is not None:
         cycle.restore(state)
-    _run(cycle, path, key, progress)
+    _run(cycle, path, key, progress, watcher)
     return EnsembleRun(cycle.analyses.recording(f"ensemble of {members} SPH simulations"), accounts_of(cycle))
 
 
-def _run(cycle: Cycle, path: Path | None, key: str, progress: bool) -> None:
-    frames = range(cycle.done, cycle.measured.frames)
-    for frame in tqdm(frames, desc="ensemble", unit="frame", disable=None if progress else True):
+def _run(cycle: Cycle, path: Path | None, key: str, progress: bool, watcher: Watcher | None) -> None:
+    count = cycle.measured.frames
+    if watcher is not None:
+        watcher.begins()
+    for frame in tqdm(range(cycle.done, count), desc="ensemble", unit="frame", disable=None if progress else True):
         if frame == 0:
             cycle.begin()
         else:
             cycle.step(frame)
         if path is not None:
             checkpoint.save(path, key, cycle.state())
+        if watcher is not None:
+            watcher.frame_done(FrameDone(frame, count, cycle.alive, cycle.count))
+            if anywhere(watcher.asked_to_stop()) and frame + 1 < count:
+                raise Stopped(f"stopped after frame {frame + 1} of {count}")
 
 
-def _further(also: geometry.Recording | PreparedMeasurement, first: PreparedMeasurement) -> PreparedMeasurement:
+def further(also: geometry.Recording | PreparedMeasurement, first: PreparedMeasurement) -> PreparedMeasurement:
     """A further measurement with its own error model, for the state of the first."""
     prepared = PreparedMeasurement.of(also, progress=first.progress)
     dimension, wanted = prepared.recording.dimension, first.recording.dimension
     if dimension != wanted:
         raise ValueError(f"a further measurement has {dimension} dimensions, the first one {wanted}")
     return prepared
-
-
-def _identity(
-    recordings: Sequence[geometry.Recording],
-    model: Simulator,
-    coarse: Simulator,
-    filter_: Filter,
-    options: EnsembleOptions,
-    members: int,
-    seed: int,
-) -> list[object]:
-    """What must be the same for a run to go on where another stopped."""
-    simulators = [(one.scene.spacing, one.scheme, one.dtype, one.seeding) for one in (model, coarse)]
-    identity: list[object] = [simulators, filter_, options, members, seed]
-    for one in recordings:
-        identity += [one.grid, one.rho, one.mu, one.period]
-        identity += [part for name, array in one.arrays().items() for part in (name, array)]
-    return identity

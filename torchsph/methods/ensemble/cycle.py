@@ -13,6 +13,7 @@ from torch import Tensor
 import geometry
 from torchsph.assimilation import Filter
 from torchsph.evaluation.frames import SAME_TIME
+from torchsph.simulator.failures import NumericalFailure
 
 from ..measurement.observation_batch import Part, gathered
 from ..measurement.observation_operator import Measurement
@@ -22,6 +23,7 @@ from .analyses import Analyses
 from .forecast_spread import ForecastSpread
 from .forecaster import Ensemble, Forecaster
 from .options import EnsembleOptions
+from .quality import analysed_codes, first_codes
 
 
 class Cycle:
@@ -35,6 +37,12 @@ class Cycle:
         members: N.
         truth: for the record's scores alone; it never enters an analysis.
         seed: of everything random.
+
+    Attributes:
+        alive: members that lived through the last forecast.
+
+    Raises:
+        ValueError: more members are to be alive than there are.
     """
 
     def __init__(
@@ -50,6 +58,8 @@ class Cycle:
     ) -> None:
         self.measurements, self.forecaster = list(measurements), forecaster
         self.options, self.count = options, members
+        if members < (options.minimum_members or 0):
+            raise ValueError(f"minimum_members is {options.minimum_members}, but there are only {members} members")
         self.measured, self.grid = measurements[0].recording, measurements[0].grid
         self.splines = measurements[0].prepared.splines
         self.generator = torch.Generator().manual_seed(seed)
@@ -59,6 +69,7 @@ class Cycle:
         )
         self.forecast_spread = ForecastSpread(measurements[0], options, members, self.generator, self.analyses)
         self._ensemble: Ensemble | None = None
+        self.alive = members
 
     @property
     def ensemble(self) -> Ensemble:
@@ -82,7 +93,8 @@ class Cycle:
         [(control, draws)] = shared([partial(self._first, generator)])
         parameters = {one.parameter.name: one.draw(self.count, self.generator) for one in self.options.estimated}
         self._ensemble = Ensemble(control, control + draws, parameters).centred()
-        self.analyses.add(self.ensemble, control, torch.where(mask, self.ensemble.members.std(0), 0.0), 0)
+        sigma = torch.where(mask, self.ensemble.members.std(0), 0.0)
+        self.analyses.add(self.ensemble, control, sigma, first_codes(self.measurements[0], mask), 0)
 
     def _first(self, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """The first control (D, *shape), and deviations of the members (N, D, *shape)."""
@@ -108,6 +120,7 @@ class Cycle:
         if is_last() and self.options.model_error > 0:
             noise = self.forecast_spread.perturbations(frame, 1.0, generator)
         forecasts = self.forecaster.advance(self.ensemble, before, early, times, masks)
+        self._count_alive(forecasts.failed, now)
         self.analyses.shocks.append(forecasts.shock)
         states = self.forecast_spread.prepared(forecasts, from_last(noise), frame, self.analyser.spread_match.factor)
         missing = int((late & ~forecasts.covered).sum())
@@ -118,10 +131,22 @@ class Cycle:
             self.analyser.coast()
             self.analyses.happened(frame, coasted=True)
             self._ensemble = states[-1]
-            sigma = torch.where(late, self.ensemble.members.std(0), 0.0)
+            sigma, reason = torch.where(late, self.ensemble.members.std(0), 0.0), torch.empty(0)
         else:
             self._ensemble, sigma = self.analyser.analyse(states[-1], batch, frame)
-        self.analyses.add(self.ensemble, torch.where(late, self.ensemble.control, 0.0), sigma, missing)
+            reason = self.analyser.reason
+        quality = analysed_codes([] if batch is None else batch.parts, reason, late, forecasts.covered, self.grid)
+        self.analyses.add(self.ensemble, torch.where(late, self.ensemble.control, 0.0), sigma, quality, missing)
+
+    def _count_alive(self, failed: Tensor, time: float) -> None:
+        """Count the members that are not among the failed (N,); refuse to go on where too few are left."""
+        self.alive = self.count - int(failed.sum())
+        least = self.options.minimum_members
+        if least is not None and self.alive < least:
+            raise NumericalFailure(
+                f"{self.alive} of {self.count} members lived through the forecast to {time:g} s, fewer than the "
+                f"{least} of minimum_members; try a larger spacing, or look at the walls and valves around that time"
+            )
 
     def state(self) -> dict[str, Any]:
         """Everything that the next step depends on, as tensors and plain values."""

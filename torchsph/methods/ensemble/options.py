@@ -62,6 +62,8 @@ class EnsembleOptions:
             and 4, and the claim falls from .81 of the error to .65 and .43. Perturbations that are fresh in every
             cycle leave the members little that ties them to their own past, and what so few sample of it is mostly
             chance.
+        minimum_members: a forecast that fewer members live through ends the run; None: those that are left go on as
+            long as there is one, and failed ones are replaced by them.
         transfer: how grid forecasts are put together.
         estimated: parameters of the simulator to be learned.
     """
@@ -77,11 +79,12 @@ class EnsembleOptions:
     kernel: float | None = None
     batch: int = 8
     lag: int | None = None
+    minimum_members: int | None = None
     transfer: Transfer = Transfer()
     estimated: tuple[Estimated, ...] = ()
 
     def __post_init__(self) -> None:
-        for name in ("length", "localisation", "choose_every", "batch", "lag"):
+        for name in ("length", "localisation", "choose_every", "batch", "lag", "minimum_members"):
             if getattr(self, name) is not None and not getattr(self, name) > 0:
                 raise ValueError(f"EnsembleOptions.{name} must be positive, got {getattr(self, name)}")
         for name in ("model_error", "relaxation"):

@@ -18,6 +18,7 @@ from regularize.solvers.factor import Factor
 
 from ..runtime.parallel import shared
 from .flux_data import flux_data
+from .informative import refuse_silent
 from .wall_rows import at_knots, mean_certainty, open_regions, wall_rows
 from .wall_trust import wall_trust
 
@@ -54,6 +55,7 @@ class FrameSmoother:
     ) -> None:
         if choose_every < 1:
             raise ValueError(f"choose_every must be at least 1, got {choose_every}")
+        refuse_silent(recording)
         self.estimates = geometry.estimated(recording) if estimates is None else estimates
         recording = self.estimates.recording
         self.type = geometry.measurement_type(recording)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import io
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,15 +13,22 @@ import numpy as np
 import torch
 import torch.distributed as dist
 
-from geometry.recordings.whole_file import write_whole
+from geometry.recordings.whole_file import refuse_special, write_whole
 
-_OPENING = b"torchsph checkpoint 4\n"  # then the SHA-256 of all that follows its line, the key, and torch's own file
+_NAME = b"torchsph checkpoint "
+_OPENING = _NAME + b"5\n"  # then the SHA-256 of all that follows its line, the key, and torch's own file
+
+
+def run_key(parts: Mapping[str, Sequence[object]]) -> str:
+    """The key of a run: its version and a fingerprint of each named part, so that a refusal can say which differs."""
+    version = sys.modules["torchsph"].__version__  # this module's own package: to import it here would be a circle
+    named = [f"{name}={fingerprint(part)}" for name, part in parts.items()]
+    return ";".join([f"version of torchsph={version}", *named])
 
 
 def fingerprint(parts: Iterable[object]) -> str:
-    """A digest of the version, of arrays by their bytes and of everything else by its ``repr``."""
-    version = sys.modules["torchsph"].__version__  # this module's own package: to import it here would be a circle
-    digest = hashlib.sha256(f"torchsph {version}\n".encode())
+    """A digest of arrays by their bytes and of everything else by its ``repr``."""
+    digest = hashlib.sha256()
     for part in parts:
         if isinstance(part, np.ndarray):
             digest.update(str((part.shape, part.dtype)).encode())
@@ -54,9 +61,39 @@ def refuse_damaged(path: Path) -> None:
 
     Raises:
         ValueError: it cannot be gone on from.
+        FileExistsError: it is a link or a device, which no checkpoint would be written to.
     """
+    refuse_special(path)
     if path.exists():
         _verified(path)
+
+
+def refuse_foreign(path: Path, key: str) -> None:
+    """Refuse a checkpoint of another run, as ``load`` does, without loading it.
+
+    Raises:
+        ValueError: it is damaged, or was written by another run.
+        FileExistsError: as ``refuse_damaged``.
+    """
+    refuse_special(path)
+    if path.exists():
+        _packed(path, key)
+
+
+def refuse_other_file(path: Path) -> None:
+    """Refuse to begin a run whose checkpoints would take the place of a file that is none.
+
+    Raises:
+        ValueError: it is somebody's file.
+        FileExistsError: as ``refuse_damaged``.
+    """
+    refuse_special(path)
+    if not path.exists():
+        return
+    with path.open("rb") as file:
+        opening = file.read(len(_NAME))
+    if opening != _NAME:
+        raise ValueError(f"{path}: is no checkpoint, and would be replaced by one; move it, or choose another --out")
 
 
 def load(path: Path, key: str) -> dict[str, Any] | None:
@@ -82,13 +119,23 @@ def load(path: Path, key: str) -> dict[str, Any] | None:
 
 def _state(path: Path, key: str) -> dict[str, Any]:
     """The state of this run."""
+    return torch.load(io.BytesIO(_packed(path, key)), weights_only=True)
+
+
+def _packed(path: Path, key: str) -> bytes:
+    """The state of this run as torch has packed it."""
     written, packed = _verified(path)
     if written != key:
-        raise ValueError(
-            f"{path}: belongs to a run with other recordings, options, members, seed or version of torchsph; resume "
-            "with the same ones, or remove it and start anew"
-        )
-    return torch.load(io.BytesIO(packed), weights_only=True)
+        differing = _differing(written, key)
+        other = f"another {differing}" if differing else "other recordings, options, members, seed or version"
+        raise ValueError(f"{path}: belongs to a run with {other}; resume with the same, or remove it and start anew")
+    return packed
+
+
+def _differing(written: str, key: str) -> str:
+    """The names of the parts in which two keys differ; nothing where they are not made alike."""
+    one, other = (dict(part.partition("=")[::2] for part in each.split(";")) for each in (written, key))
+    return ", ".join(name for name in other if one[name] != other[name]) if one.keys() == other.keys() else ""
 
 
 def _verified(path: Path) -> tuple[str, bytes]:

@@ -113,3 +113,12 @@ def from_last(value: T) -> T:
     held = [value]
     dist.broadcast_object_list(held, dist.get_world_size() - 1)
     return held[0]
+
+
+def anywhere(wish: bool) -> bool:
+    """Whether any process wishes it, told to all; every process has to ask."""
+    if not dist.is_initialized():
+        return wish
+    wished = torch.tensor([int(wish)])
+    dist.all_reduce(wished, dist.ReduceOp.MAX)
+    return bool(wished.item())

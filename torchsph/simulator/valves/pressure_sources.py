@@ -68,17 +68,20 @@ class PressureSources(ValveModel):
         if not clock.open_regions:
             return None
         strength = per_particle(clock.valve_strength, particles.member)
-        by_sources = self._acceleration(particles, clock.open_regions, clock.of_particles(particles))
+        by_sources = self._acceleration(particles, clock.open_regions, clock.of_members(particles.members))
         return by_sources * (strength[:, None] if isinstance(strength, Tensor) else strength)
 
     def _acceleration(self, particles: Particles, open_regions: tuple[int, ...], times: Tensor) -> Tensor:
-        """At strength 1, at the mean of the particles' ``times`` (N,), s."""
-        time = float(times.mean()) if times.numel() else 0.0
+        """At strength 1, at each member's own time (members,), s."""
         unit = self.units.length**self._dimension / self.units.time**2
-        part = self.strength(time) / unit / len(open_regions)
+        moments, which = torch.unique(times, return_inverse=True)
+        known = [float(moment) for moment in moments]
+        share = [self.strength(time) / unit / len(open_regions) for time in known]
+        part = torch.tensor(share).to(particles.position)[which][particles.member][:, None]
         total = torch.zeros_like(particles.position)
         for region in open_regions:
-            offset = particles.position - self._centre(region, time)
+            centre = torch.stack([self._centre(region, time) for time in known])[which]
+            offset = particles.position - centre.index_select(0, particles.member)
             square = (offset * offset).sum(1, keepdim=True) + self._core[region] ** 2
             if self._dimension == 3:
                 total = total + part / (2.0 * math.pi) * offset / square**1.5

@@ -29,3 +29,8 @@ def _(options: PressureSource, setting: ValveSetting) -> ValveModel:
 @valve_model.register
 def _(options: Reservoir, setting: ValveSetting) -> ValveModel:
     return Reservoirs(options, setting)
+
+
+def registered_models() -> list[type]:
+    """The types of options that valves can be made of."""
+    return [kind for kind in valve_model.registry if kind is not object]

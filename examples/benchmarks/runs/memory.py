@@ -1,0 +1,92 @@
+"""Predicted against measured memory of whole ensemble runs, each in a process of its own.
+
+    python examples/benchmarks/runs/memory.py [--quick]
+
+Prints, for each scene, what `torchsph.methods.memory` predicts beyond the process at its start, the peak of resident
+memory that the run then added to it (getrusage), their ratio, and the ratio of the whole processes' peaks.
+"""
+
+from __future__ import annotations
+
+import json
+import resource
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+
+ROOT = Path(__file__).resolve().parents[3]
+sys.path.insert(0, str(ROOT))
+
+# recording, frames, particle spacing (m; None: the default), members
+SCENES = (
+    ("sample", 2, None, 3),
+    ("sample", 8, None, 16),
+    ("sample", 2, 1.5e-3, 16),
+    ("sample", 2, 1e-3, 16),
+    ("phantom", 3, None, 16),
+    ("plane", 2, None, 8),
+    ("box", 2, None, 4),
+)
+
+
+def scene(name: str, frames: int):
+    """A stretch of the sample or the phantom, a plane of 100 x 100 nodes, or a cube of 24."""
+    import geometry
+    from torchsph.data import sample_measurement
+
+    if name in ("sample", "phantom"):
+        phantom = ROOT.parent / "shared" / "data" / "lv_phantom_a_measured.h5"
+        path, first = (sample_measurement(), 8) if name == "sample" else (phantom, 20)
+        return geometry.read_recording(path).select(slice(first, first + frames))
+    sys.path[:0] = [str(ROOT / "tests"), str(ROOT / "tests" / "support")]
+    from conftest import box_recording
+
+    dimension, nodes = (2, 100) if name == "plane" else (3, 24)
+    size, noise = nodes * 1e-3, np.random.default_rng(0)
+
+    def flow(points: np.ndarray, _: float) -> np.ndarray:
+        return 0.1 * np.sin(2 * np.pi * points[:, ::-1] / size) + noise.normal(0.0, 0.01, points.shape)
+
+    return box_recording(flow, dimension=dimension, size=size, nodes=nodes, times=tuple(0.005 * np.arange(frames)))
+
+
+def peak() -> int:
+    """Bytes of resident memory at most so far."""
+    return 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+
+
+def run(name: str, frames: int, spacing: float | None, members: int) -> dict[str, float]:
+    """One scene in this process."""
+    from torchsph.methods import by_name
+    from torchsph.methods.measurement.prepared import PreparedMeasurement
+
+    measured = scene(name, frames)
+    start = peak()
+    prepared = PreparedMeasurement(measured)
+    foretold = by_name.predicted_memory(prepared, ("ensemble",), spacing=spacing, members=members).total
+    by_name.run_methods(measured, ("ensemble",), spacing=spacing, members=members)
+    return {"start": start, "predicted": foretold, "measured": peak() - start}
+
+
+def main() -> None:
+    """Run the scenes one after another and print the table."""
+    if len(sys.argv) > 1 and sys.argv[1] == "--scene":
+        print(json.dumps(run(*SCENES[int(sys.argv[2])])))
+        return
+    print(
+        f"{'scene':8} {'frames':>6} {'spacing':>8} {'members':>7} {'predicted MB':>12} {'measured MB':>11} ratio  whole"
+    )
+    for number in range(2 if "--quick" in sys.argv else len(SCENES)):
+        call = [sys.executable, "-W", "ignore", __file__, "--scene", str(number)]
+        found = json.loads(subprocess.run(call, check=True, capture_output=True, text=True).stdout.splitlines()[-1])
+        name, frames, spacing, members = SCENES[number]
+        ratio = found["predicted"] / found["measured"]
+        whole = (found["start"] + found["predicted"]) / (found["start"] + found["measured"])
+        told = f"{name:8} {frames:6} {spacing or '-':>8} {members:7} {found['predicted'] / 1e6:12.0f}"
+        print(f"{told} {found['measured'] / 1e6:11.0f} {ratio:5.2f}  {whole:5.2f}", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,68 @@
+"""The same seed gives the same bits for any number of threads, again and again, beside a busy process too."""
+
+import multiprocessing
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+import torch
+
+import geometry
+from torchsph import PreparedMeasurement, Scene, Simulator, assimilate, filter_sph, preset
+from torchsph.data import sample_measurement
+
+
+@contextmanager
+def threads(number):
+    before = torch.get_num_threads()
+    torch.set_num_threads(number)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def _spin():
+    while True:
+        pass
+
+
+@contextmanager
+def busy_process():
+    """Another process that takes a core, so that threads arrive in another order every time."""
+    process = multiprocessing.get_context("spawn").Process(target=_spin, daemon=True)
+    process.start()
+    try:
+        yield
+    finally:
+        process.kill()
+        process.join()
+
+
+def frames(first, last):
+    return geometry.read_recording(sample_measurement()).select(slice(first, last))
+
+
+def test_splines_have_the_same_bits_with_any_number_of_threads():
+    measured, found = frames(9, 10), []
+    for number in (1, 2):
+        with threads(number):
+            found.append(PreparedMeasurement(measured).smoothed.velocity)
+    np.testing.assert_array_equal(found[0], found[1])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scheme", ["default", "weakly_compressible"])
+def test_every_method_has_the_same_bits_with_any_number_of_threads(scheme):
+    """Splines, ensemble and particle filter of three frames; minutes, for 1, 2 and 3 threads twice."""
+    measured, found = frames(9, 12), []
+    model = Simulator(Scene.from_recording(measured, 3e-3), preset(scheme))
+    for number in (1, 2, 3, 1, 2, 3):
+        with threads(number), busy_process():
+            prepared = PreparedMeasurement(measured)
+            run = assimilate(prepared, model, members=4, seed=1).recording
+            particles = filter_sph(prepared, model, seed=1).recording
+            found.append([prepared.smoothed.velocity, run.velocity, run.sigma, particles.velocity])
+    for other in found[1:]:
+        for mine, first in zip(other, found[0], strict=True):
+            np.testing.assert_array_equal(mine, first)

@@ -1,0 +1,205 @@
+"""Memory that a run will take, before it takes it; what is free, and what to change where that is less.
+
+The parts and their sizes are counted from the recording and the options; what a particle, a spline's sample or a node
+of a wall's table costs was measured on the CPU: within a quarter of what runs took
+(`examples/benchmarks/runs/memory.py`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+import geometry
+from regularize.rows.operators import System, VectorRows
+from regularize.smoothing.knot_grid import knots_for
+from regularize.smoothing.samples import FitData
+from regularize.solvers.memory import band_bytes
+from torchsph.pairs.smoothing_kernels import kernel
+from torchsph.simulator.schemes.scheme import Scheme
+
+from .measurement.prepared import PreparedMeasurement
+
+_BANDS = 4  # copies of a spline's band that live at once while its smoothness is chosen
+_PER_SAMPLE = 10_000  # bytes of rows and of errors that neighbours share
+_PER_PARTICLE = {2: 1_000, 3: 3_000}  # bytes of state, neighbours and sums
+_TABLES_KEPT, _TABLE_MEMORY = 24, 1 << 29  # as `simulator.walls.fields` keeps them
+_SETS_OF_OPENINGS = 2  # tables for each key time: valves open and close in between
+_TABLES_IN_MAKING = 3  # what transforms and distances take while one is made
+_LIBRARIES = 30 << 20  # what is loaded at the first fit and the first step
+_COPIES_OF_RECORDING, _COPIES_OF_MEMBERS = 10, 6
+
+
+class NotEnoughMemory(MemoryError):
+    """A run would need more memory than is free; the message says what to change."""
+
+
+@dataclass(frozen=True)
+class MemoryPrediction:
+    """Bytes that a run takes beyond what its process has at the start, by what they are for.
+
+    Attributes:
+        splines: bands and rows while the smoothness is chosen.
+        particles: of all runs that live at once.
+        tables: of the walls.
+        members: grid fields of the ensemble.
+        recordings: the measurement's arrays and those of the results.
+    """
+
+    splines: int
+    particles: int
+    tables: int
+    members: int
+    recordings: int
+
+    @property
+    def total(self) -> int:
+        """Bytes."""
+        return _LIBRARIES + sum(vars(self).values())
+
+    def refuse_beyond(self, free: int | None) -> None:
+        """Refuse a run that does not fit.
+
+        Args:
+            free: bytes; None where nobody knows.
+
+        Raises:
+            NotEnoughMemory: it needs more.
+        """
+        if free is None or self.total <= free:
+            return
+        parts = {name: size for name, size in vars(self).items() if size > 0}
+        largest = max(parts, key=lambda name: parts[name])
+        told = ", ".join(f"{name} {_size(size)}" for name, size in sorted(parts.items(), key=lambda one: -one[1]))
+        raise NotEnoughMemory(
+            f"needs about {_size(self.total)} of memory ({told}), but only {_size(free)} are free; {_CURES[largest]}"
+        )
+
+
+_CURES = {
+    "splines": "give a recording on a coarser grid, or of a smaller part",
+    "particles": "try a larger --spacing",
+    "tables": "try a larger --spacing",
+    "members": "try fewer --members",
+    "recordings": "give fewer frames, or a coarser grid",
+}
+
+
+def predicted(
+    prepared: PreparedMeasurement,
+    scheme: Scheme,
+    *,
+    spacings: Iterable[tuple[float, int]] = (),
+    members: int = 0,
+    further: Iterable[geometry.Recording] = (),
+) -> MemoryPrediction:
+    """What a run on a measurement will take at its peak.
+
+    Args:
+        prepared: the measurement.
+        scheme: of the simulators.
+        spacings: particle spacing (m) and number of members of every simulation that lives beside others.
+        members: of the ensemble; 0 without one.
+        further: more measurements of the beat.
+    """
+    recording = prepared.recording
+    dimension, field = recording.dimension, 4 * recording.dimension * recording.grid.size
+    volume = float(recording.mask.reshape(recording.frames, -1).sum(1).max()) * float(np.prod(recording.grid.spacing))
+    runs = list(spacings)
+    particles = sum(int(count * volume / spacing**dimension) for spacing, count in runs) * _PER_PARTICLE[dimension]
+    arrays = sum(value.nbytes for one in (recording, *further) for value in one.arrays().values())
+    return MemoryPrediction(
+        splines=_splines(prepared),
+        particles=particles,
+        tables=sum(_tables(recording, scheme, spacing) for spacing in dict(runs)),
+        members=_COPIES_OF_MEMBERS * members * field,
+        recordings=arrays + _COPIES_OF_RECORDING * recording.frames * field,
+    )
+
+
+def _splines(prepared: PreparedMeasurement) -> int:
+    """Of the frame with the most nodes in its mask, by the knots and the band that its fit will have."""
+    recording, splines = prepared.recording, prepared.splines
+    frame = int(np.argmax(recording.mask.reshape(recording.frames, -1).sum(1)))
+    inside = torch.from_numpy(np.array(recording.mask[frame], bool).reshape(-1))
+    points = splines.nodes[inside].double()
+    if not len(points):
+        return 0
+    silent = torch.zeros_like(points)
+    data = FitData.checked(points, silent, divergence_points=points)
+    knots = knots_for(data, splines.smoother)
+    band = band_bytes(System(knots, recording.dimension, [VectorRows(knots, points, silent, silent)], 0.0))
+    return _BANDS * band + _PER_SAMPLE * len(points)
+
+
+def _tables(recording: geometry.Recording, scheme: Scheme, spacing: float) -> int:
+    """Of the walls at a particle spacing: those that are kept, and one in the making."""
+    vertices = recording.wall_for("the simulator").vertices.reshape(-1, recording.dimension)
+    margin = (kernel(scheme.kernel).support * scheme.smoothing_ratio + 2.0) * spacing
+    nodes = float(np.prod(np.floor((np.ptp(vertices, axis=0) + 2 * margin) / (0.5 * spacing)) + 2))
+    channels = 1 + 2 * recording.dimension
+    if scheme.wall.complete:
+        channels += 1 + recording.dimension + int(scheme.wall.sliding)
+    each = 4 * channels * nodes
+    moving = recording.frames if recording.wall_for("the simulator").moves else 1
+    kept = min(_SETS_OF_OPENINGS * moving, max(_TABLES_KEPT, _TABLE_MEMORY // each))
+    return int(each * (kept + _TABLES_IN_MAKING))
+
+
+def free_memory() -> int | None:
+    """Bytes that this process may still take: what the machine has left, and the control group; None if unknown."""
+    found = [size for size in (_machine(), _control_group()) if size is not None]
+    return min(found, default=None)
+
+
+def _machine() -> int | None:
+    try:
+        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
+        return next(1024 * int(line.split()[1]) for line in lines if line.startswith("MemAvailable:"))
+    except (OSError, StopIteration, ValueError):
+        return None
+
+
+def _control_group(root: Path = Path("/sys/fs/cgroup"), own: Path = Path("/proc/self/cgroup")) -> int | None:
+    """What the tightest of the groups around this process leaves (cgroup v2, or v1's memory controller)."""
+    try:
+        entries = [line.split(":", 2) for line in own.read_text(encoding="utf-8").splitlines()]
+    except OSError:
+        return None
+    left: list[int] = []
+    for _, controllers, path in entries:
+        if controllers == "":
+            base, most, used, cache = root, "memory.max", "memory.current", "inactive_file "
+        elif "memory" in controllers.split(","):
+            base, most, used = root / "memory", "memory.limit_in_bytes", "memory.usage_in_bytes"
+            cache = "total_inactive_file "
+        else:
+            continue
+        group = base / path.lstrip("/")
+        for folder in (group, *group.parents):
+            size = _left(folder, most, used, cache)
+            left += [] if size is None else [size]
+            if folder == base:
+                break
+    return min(left, default=None)
+
+
+def _left(folder: Path, most: str, used: str, cache: str) -> int | None:
+    try:
+        limit = (folder / most).read_text(encoding="ascii").strip()
+        if limit == "max":
+            return None
+        taken = int((folder / used).read_text(encoding="ascii"))
+        lines = (folder / "memory.stat").read_text(encoding="ascii").splitlines()
+    except (OSError, ValueError):  # no such group here, or another kind of file
+        return None
+    spare = next((int(line.split()[1]) for line in lines if line.startswith(cache)), 0)
+    return max(0, int(limit) - taken + spare)
+
+
+def _size(count: float) -> str:
+    return f"{count / 1e9:.3g} GB" if count >= 1e9 else f"{count / 1e6:.3g} MB"
