@@ -46,7 +46,7 @@ def flux_data(
         motion: of its wall.
         frame: its number.
         field: the spline, which is asked where it is known.
-        open_together: regions whose fluxes sum to dV/dt; fewer than two: that is no equation.
+        open_together: regions whose fluxes sum to dV/dt; (): that is no equation.
         rate_sigma: m^3/s, standard deviation of dV/dt.
     """
     time = float(recording.time[frame])
@@ -57,7 +57,7 @@ def flux_data(
         if opening is not None:
             value = opening.value + float(flux.value[frame])
             equations.append(opening._replace(value=value, sigma=max(opening.sigma, float(flux.deviation[frame]))))
-    whole = _opening(motion, time, open_together, field) if len(open_together) > 1 else None
+    whole = _opening(motion, time, open_together, field) if open_together else None
     if whole is not None:
         value = whole.value + motion.volume_rate(time)
         equations.append(whole._replace(value=value, sigma=max(whole.sigma, rate_sigma)))

@@ -163,7 +163,15 @@ class FrameSmoother:
         """Rows of the walls at a frame; None where the recording has no wall."""
         if self.motion is None:
             return None
-        return wall_rows(self.recording, self.motion, frame, at_rest=at_rest, sampler=self._sampler, knots=self._knots)
+        return wall_rows(
+            self.recording,
+            self.motion,
+            frame,
+            at_rest=at_rest,
+            sampler=self._sampler,
+            knots=self._knots,
+            free=self.estimates.contradicted,
+        )
 
     @property
     def _knots(self) -> float:
@@ -194,7 +202,7 @@ class FrameSmoother:
         components = self.type.at(frame, torch.nonzero(used).squeeze(1))
         points, rows, confidence, beam = components.spline_rows(self.nodes[used], samples[used], weight[used])
         together = self._open_together(frame)
-        known_flux = walls and (bool(recording.fluxes) or len(together) > 1) and self.type.full
+        known_flux = walls and (bool(recording.fluxes) or bool(together)) and self.type.full
         smoother = self._trusting(frame) if walls else self.smoother
         fitted = smoother.fit(
             points,
@@ -209,8 +217,14 @@ class FrameSmoother:
         return self._with_fluxes(fitted, frame, together, uncertainty=uncertainty) if known_flux else fitted
 
     def _open_together(self, frame: int) -> tuple[int, ...]:
-        """Regions that are open at a frame; () without walls."""
-        return () if self.motion is None else open_regions(self.recording, float(self.recording.time[frame]))
+        """Regions at a frame whose fluxes are the data's to say, their sum dV/dt; () where walls alone tell it.
+
+        That is where several are open, and where the velocities tell of another flow than the walls.
+        """
+        if self.motion is None:
+            return ()
+        regions = open_regions(self.recording, float(self.recording.time[frame]))
+        return regions if len(regions) > 1 or self.estimates.contradicted else ()
 
     def _trusting(self, frame: int) -> regularize.Smoother:
         """The smoother with the strength that the walls of a frame deserve: less where they are uncertain."""
@@ -220,7 +234,7 @@ class FrameSmoother:
         if group not in self._trust:
             self._trust[group] = 1.0
             middle = self._middle(group)
-            if smoother.automatic and middle is not None and len(self._open_together(middle)) > 1:
+            if smoother.automatic and middle is not None and self._open_together(middle):
                 free, rows = self._fit(middle, uncertainty=True, walls=False), self._walls(middle)
                 self._trust[group] = 1.0 if rows is None else wall_trust(free, rows, smoother.wall)
         trust = self._trust[group] * mean_certainty(self.recording, frame, self._knots)
@@ -233,6 +247,12 @@ class FrameSmoother:
         wall, data = self.estimates.wall, None
         rate_sigma = 0.0 if wall is None else float(wall.rate_sigma[frame])
         if self.motion is not None:
+            if self.estimates.flow is not None and self.estimates.contradicted:
+                # the walls' own error cannot be less than what the velocities have against them
+                against = abs(1 - self.estimates.flow.ratio) * self.motion.volume_rate(
+                    float(self.recording.time[frame])
+                )
+                rate_sigma = max(rate_sigma, abs(against))
             data = flux_data(self.recording, self.motion, frame, fitted, together, rate_sigma)
         if data is not None:
             fitted = regularize.with_linear_data(fitted, data)

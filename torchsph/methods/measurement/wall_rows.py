@@ -50,6 +50,7 @@ def wall_rows(
     at_rest: bool = False,
     sampler: geometry.WallSampler | None = None,
     knots: float = 0.0,
+    free: bool = False,
 ) -> WallRows:
     """One row per wall point at a frame, weighted by area.
 
@@ -67,6 +68,7 @@ def wall_rows(
         at_rest: every velocity zero, the rows of an increment between two fields that both obey the walls.
         sampler: points on the wall; None: one in the middle of each face, with its exact area and normal.
         knots: m, knot distance of the splines, which an uncertain wall is held against.
+        free: leave a single open orifice to the data as well.
     """
     time = float(recording.time[frame])
     surface = motion.surface(time)
@@ -76,12 +78,13 @@ def wall_rows(
     else:
         points = sampler.at(time)
     velocity, regions = points.velocities, open_regions(recording, time)
-    if len(regions) == 1:
+    plug = len(regions) == 1 and not free
+    if plug:
         vector = surface.area_vectors[surface.part(regions[0])].sum(0)
         area = float(np.linalg.norm(vector))
         velocity[points.region == regions[0]] += -motion.volume_rate(time) / area * vector / area
     no_slip = ~np.isin(points.region, regions)
-    good = (points.areas > 0) & (no_slip | (len(regions) == 1))
+    good = (points.areas > 0) & (no_slip | plug)
 
     def tensor(values: np.ndarray) -> torch.Tensor:
         return torch.from_numpy(np.ascontiguousarray(values[good]))
