@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 import geometry
-from regularize import LinearData, SplineField
+from regularize import LinearData, SplineField, with_linear_data
 
 # a flux is held against a spline that is known over at least this part of the opening; the rest is taken to be like it
 _LEAST_COVERAGE = 0.5
@@ -71,6 +71,33 @@ def flux_data(
         value=torch.tensor([one.value for one in equations], dtype=torch.float64),
         sigma=torch.tensor([one.sigma for one in equations], dtype=torch.float64),
     )
+
+
+def with_fluxes(
+    fitted: SplineField,
+    recording: geometry.Recording,
+    motion: geometry.WallMotion,
+    frame: int,
+    open_together: Sequence[int],
+    estimates: geometry.Estimates,
+) -> SplineField:
+    """The spline of a frame, fitted with ``uncertainty=True``, with what is known of the fluxes through its openings.
+
+    Args:
+        fitted: the spline.
+        recording: whose measured fluxes count.
+        motion: of its wall.
+        frame: its number.
+        open_together: see ``flux_data``.
+        estimates: of the recording's walls, for the error of dV/dt.
+    """
+    rate_sigma = 0.0 if estimates.wall is None else float(estimates.wall.rate_sigma[frame])
+    if estimates.flow is not None and estimates.contradicted:
+        # the walls' own error cannot be less than what the velocities have against them
+        against = (1 - estimates.flow.ratio) * motion.volume_rate(float(recording.time[frame]))
+        rate_sigma = max(rate_sigma, abs(against))
+    data = flux_data(recording, motion, frame, fitted, open_together, rate_sigma)
+    return fitted if data is None else with_linear_data(fitted, data)
 
 
 def _opening(motion: geometry.WallMotion, time: float, labels: Sequence[int], field: SplineField) -> _Flux | None:

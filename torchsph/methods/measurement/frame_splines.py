@@ -17,7 +17,7 @@ import regularize
 from regularize.solvers.factor import Factor
 
 from ..runtime.parallel import shared
-from .flux_data import flux_data
+from .flux_data import with_fluxes
 from .informative import refuse_silent
 from .wall_rows import at_knots, mean_certainty, open_regions, wall_rows
 from .wall_trust import wall_trust
@@ -88,16 +88,9 @@ class FrameSmoother:
             return None
         group = frame // self.choose_every
         if group not in self._choices:
-            middle = self._middle(group)
+            middle = _middle(self, group)
             self._choices[group] = None if middle is None else self._fit(middle).choice
         return self._choices[group]
-
-    def _middle(self, group: int) -> int | None:
-        """The middle frame of a group, or the nearest to it that measured anything; None where none did."""
-        first = group * self.choose_every
-        members = range(first, min(first + self.choose_every, self.recording.frames))
-        from_middle = sorted(members, key=lambda k: abs(k - first - self.choose_every // 2))
-        return next((k for k in from_middle if self.measures(k)), None)
 
     def fit(self, frame: int, *, uncertainty: bool = False) -> regularize.SplineField:
         """The spline of one frame; ``uncertainty`` keeps what its standard deviation needs.
@@ -202,7 +195,7 @@ class FrameSmoother:
         components = self.type.at(frame, torch.nonzero(used).squeeze(1))
         points, rows, confidence, beam = components.spline_rows(self.nodes[used], samples[used], weight[used])
         together = self._open_together(frame)
-        known_flux = walls and (bool(recording.fluxes) or bool(together)) and self.type.full
+        known_flux = walls and self.motion is not None and (bool(recording.fluxes) or bool(together)) and self.type.full
         smoother = self._trusting(frame) if walls else self.smoother
         fitted = smoother.fit(
             points,
@@ -214,13 +207,15 @@ class FrameSmoother:
             uncertainty=uncertainty or known_flux,
             choice=choice,
         )
-        return self._with_fluxes(fitted, frame, together, uncertainty=uncertainty) if known_flux else fitted
+        if self.motion is None or not known_flux:
+            return fitted
+        fitted = with_fluxes(fitted, recording, self.motion, frame, together, self.estimates)
+        if not uncertainty:
+            fitted.posterior = fitted.factor = None  # they take as much memory as all else together
+        return fitted
 
     def _open_together(self, frame: int) -> tuple[int, ...]:
-        """Regions at a frame whose fluxes are the data's to say, their sum dV/dt; () where walls alone tell it.
-
-        That is where several are open, and where the velocities tell of another flow than the walls.
-        """
+        """Regions at a frame whose fluxes are for the data to say: several, or velocities contradict the walls."""
         if self.motion is None:
             return ()
         regions = open_regions(self.recording, float(self.recording.time[frame]))
@@ -233,32 +228,12 @@ class FrameSmoother:
             return smoother
         if group not in self._trust:
             self._trust[group] = 1.0
-            middle = self._middle(group)
+            middle = _middle(self, group)
             if smoother.automatic and middle is not None and self._open_together(middle):
                 free, rows = self._fit(middle, uncertainty=True, walls=False), self._walls(middle)
                 self._trust[group] = 1.0 if rows is None else wall_trust(free, rows, smoother.wall)
         trust = self._trust[group] * mean_certainty(self.recording, frame, self._knots)
         return smoother if trust == 1.0 else replace(smoother, wall=smoother.wall * trust**0.5)
-
-    def _with_fluxes(
-        self, fitted: regularize.SplineField, frame: int, together: tuple[int, ...], *, uncertainty: bool
-    ) -> regularize.SplineField:
-        """The spline with what is known of the fluxes through its openings."""
-        wall, data = self.estimates.wall, None
-        rate_sigma = 0.0 if wall is None else float(wall.rate_sigma[frame])
-        if self.motion is not None:
-            if self.estimates.flow is not None and self.estimates.contradicted:
-                # the walls' own error cannot be less than what the velocities have against them
-                against = abs(1 - self.estimates.flow.ratio) * self.motion.volume_rate(
-                    float(self.recording.time[frame])
-                )
-                rate_sigma = max(rate_sigma, abs(against))
-            data = flux_data(self.recording, self.motion, frame, fitted, together, rate_sigma)
-        if data is not None:
-            fitted = regularize.with_linear_data(fitted, data)
-        if not uncertainty:
-            fitted.posterior = fitted.factor = None  # they take as much memory as all else together
-        return fitted
 
     @property
     def groups(self) -> int:
@@ -317,6 +292,14 @@ class FrameSmoother:
         out = np.zeros((grid.dimension, grid.size), np.float32)
         out[:, mask] = fitted(self.nodes[torch.from_numpy(mask)], outside=0.0).T.numpy()
         return out.reshape(grid.dimension, *grid.shape)
+
+
+def _middle(frames: FrameSmoother, group: int) -> int | None:
+    """The middle frame of a group, or the nearest to it that measured anything; None where none did."""
+    first = group * frames.choose_every
+    members = range(first, min(first + frames.choose_every, frames.recording.frames))
+    from_middle = sorted(members, key=lambda k: abs(k - first - frames.choose_every // 2))
+    return next((k for k in from_middle if frames.measures(k)), None)
 
 
 def _motion(recording: geometry.Recording) -> geometry.WallMotion:
