@@ -13,6 +13,7 @@ from .recordings.checks import findings
 from .recordings.errors import RecordingError
 from .recordings.finding import Finding
 from .recordings.measurement_types import MeasurementType, measurement_type
+from .recordings.opening_flux import OpeningFlux
 from .recordings.quality import Quality
 from .recordings.read import read_provenance, read_recording
 from .recordings.recording import Recording, Wall
@@ -39,6 +40,7 @@ __all__ = [
     "MeasurementType",
     "MovingDistance",
     "Opening",
+    "OpeningFlux",
     "Orifice",
     "OrificePlane",
     "Quality",

@@ -11,6 +11,7 @@ from .rows.operators import CellRows, DirectionRows, DivergenceRows, System, Vec
 from .rows.sparse import sparse_matrix, sparse_operators
 from .rows.walls import WallRows
 from .smoothing.field import SplineField
+from .smoothing.linear_data import LinearData, with_linear_data
 from .smoothing.sequence import WindowedField, blur_in_time, fit_windows
 from .smoothing.smoother import Smoother
 from .solvers.block import BlockFactor
@@ -33,6 +34,7 @@ __all__ = [
     "Factor",
     "InvalidInput",
     "Knots",
+    "LinearData",
     "LinearSolver",
     "NotConverged",
     "Posterior",
@@ -54,4 +56,5 @@ __all__ = [
     "solve_direct",
     "sparse_matrix",
     "sparse_operators",
+    "with_linear_data",
 ]

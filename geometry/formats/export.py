@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from geometry.recordings.recording import Recording
+from geometry.recordings.whole_file import written_together
 
 from .source import FormatError
 from .writers.matlab import write_matlab
@@ -43,6 +44,7 @@ def export(recording: Recording, path: str | Path, to: str) -> list[Path]:
     Raises:
         FormatError: there is no such format, its package is missing, or it cannot hold the recording.
         FileNotFoundError: there is no such folder.
+        OSError: the disk is full, or a link, device or folder has a name; files appear all together or not at all.
     """
     if to not in EXPORTS:
         raise FormatError(f"export: there is no format {to!r}; known are {', '.join(EXPORTS)}")
@@ -52,4 +54,13 @@ def export(recording: Recording, path: str | Path, to: str) -> list[Path]:
         path = path.with_name(path.name + suffix)
     if not path.parent.is_dir():
         raise FileNotFoundError(f"{path}: there is no directory {path.parent}; make it first")
-    return write(path, recording)
+    with written_together(path.parent) as scratch:
+        try:
+            written = write(scratch / path.name, recording)
+        except FormatError as fault:  # says which file: the one that was asked for, not the one on the way to it
+            raise FormatError(str(fault).replace(str(scratch / path.name), str(path))) from fault
+        except OSError as fault:
+            if fault.errno is None:
+                raise
+            raise OSError(fault.errno, fault.strerror, str(path)) from fault
+    return [path.parent / file.name for file in written]

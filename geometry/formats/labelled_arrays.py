@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from geometry.grids.grid import Grid
+from geometry.recordings.opening_flux import GROUP, fluxes_of, is_flux
 from geometry.recordings.quality import QUALITY_NAMES, Quality
 from geometry.recordings.recording import LAYOUT, Recording, Wall
 
@@ -29,7 +30,9 @@ ATTRIBUTES = {
     "pressure": {"units": "Pa", "long_name": "pressure"},
     "wall_vertices": {"units": "m"},
     "wall_velocity": {"units": "m s-1"},
+    "wall_sigma": {"units": "m", "long_name": "standard deviation of a vertex's place"},
     "valve_intervals": {"units": "s", "long_name": "region, opens, closes"},
+    "valve_leak": {"units": "1", "long_name": "region, part that stays open"},
     "volume": {"units": "m3"},
     "flux_mitral": {"units": "m3 s-1", "long_name": "flux into the ventricle"},
     "flux_aortic": {"units": "m3 s-1", "long_name": "flux into the ventricle"},
@@ -51,6 +54,9 @@ def to_xarray(recording: Recording) -> xarray.Dataset:
         label = name.replace(".", "_")
         values = values.astype(np.int8) if values.dtype == np.bool_ else values
         variables[label] = (_dimensions(name, recording, values.ndim), values, ATTRIBUTES.get(label, {}))
+    for dataset, values in (item for flux in recording.fluxes for item in flux.arrays().items()):
+        about_flux = {"units": "m3 s-1", "long_name": "measured flux into the blood"}
+        variables[dataset.strip("/").replace("/", "_")] = (("time",), values, about_flux)
     grid = recording.grid
     places = {
         axis: grid.origin[number] + grid.spacing[number] * np.arange(grid.shape[-1 - number])
@@ -89,6 +95,8 @@ def from_xarray(dataset: xarray.Dataset) -> Recording:
     rest = {name: array for name, array in values.items() if not name.startswith("wall.")}
     about = {name: dataset.attrs[name] for name in ("rho", "mu", "period", "description") if name in dataset.attrs}
     whole: dict[str, Any] = {**rest, **about, **({"wall": Wall(**wall)} if wall else {})}
+    labels = {str(label).replace("flux_", f"{GROUP}/", 1): label for label in dataset.variables}
+    whole["fluxes"] = fluxes_of({name: dataset[label].values for name, label in labels.items() if is_flux(name)})
     return Recording(grid=_grid(dataset, dimension), **whole)
 
 
@@ -106,9 +114,11 @@ def _dimensions(name: str, recording: Recording, rank: int) -> tuple[str, ...]:
         "beam": ("time", "component", *space)[-rank:],
         "wall.vertices": ("time", "vertex", "component")[-rank:],
         "wall.velocity": ("time", "vertex", "component"),
+        "wall.sigma": ("time", "vertex")[-rank:],
         "wall.faces": ("face", "corner"),
         "wall.region": ("face",),
         "valve_intervals": ("interval", "column"),
+        "valve_leak": ("valve_with_leak", "column_of_leak"),
         "valve_open": ("time", "valve"),
     }
     return table.get(name, ("time", *space) if rank > 1 else ("time",))

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from geometry.recordings.recording import Recording
 
+from .flow_agreement import FlowAgreement, flow_agreement
 from .valve_times import ValveTimes, find_valve_times
 from .wall_estimate import WallEstimate, estimate_wall
 
@@ -18,17 +19,25 @@ class Estimates:
         recording: with the estimated walls and valve times; the given one where nothing was to mend.
         wall: motion of the walls, or None without walls.
         valves: times of the valves, or None without walls.
+        flow: whether velocities and walls tell of the same flow; None where that cannot be told.
     """
 
     recording: Recording
     wall: WallEstimate | None
     valves: ValveTimes | None
+    flow: FlowAgreement | None = None
+
+    @property
+    def contradicted(self) -> bool:
+        """Whether the velocities tell of another flow than the walls."""
+        return self.flow is not None and self.flow.contradicts
 
     @property
     def warnings(self) -> tuple[str, ...]:
         """One sentence for everything that is not as the file has it."""
         found = () if self.wall is None or not self.wall.uncertain else (self.wall.words(),)
-        return found if self.valves is None else (*found, *self.valves.changes)
+        found = found if self.valves is None else (*found, *self.valves.changes)
+        return found if self.flow is None or not self.flow.contradicts else (*found, self.flow.words())
 
     def summary(self) -> dict[str, object]:
         """What was found, for `metrics.json`: SI units; {} where the file stands as it is."""
@@ -47,6 +56,12 @@ class Estimates:
                 "intervals_s": self.valves.intervals.tolist(),
                 "error_s": self.valves.error.tolist(),
             }
+        if self.flow is not None and self.flow.contradicts:
+            result["flow"] = {
+                "velocities_over_walls": self.flow.ratio,
+                "error": self.flow.error,
+                "frames": self.flow.frames,
+            }
         return result
 
 
@@ -60,4 +75,5 @@ def estimated(recording: Recording) -> Estimates:
     wall = estimate_wall(recording)
     mended = wall.applied(recording)
     valves = find_valve_times(mended, wall)
-    return Estimates(valves.applied(mended), wall, valves)
+    found = valves.applied(mended)
+    return Estimates(found, wall, valves, flow_agreement(found, valves))

@@ -133,7 +133,7 @@ def _takers(recording: Recording, motion: WallMotion, labels: list[int], phases:
     if set(labels) <= {INLET, OUTLET} or len(labels) == 1:
         inlets = {labels[0]} if len(labels) == 1 else {INLET}
         return {1: inlets, -1: {labels[-1]} if len(labels) == 1 else {OUTLET}}
-    flows = {label: _flow(recording, motion, label) for label in labels}
+    flows = {label: measured_flow(recording, motion, label) for label in labels}
     takers = {}
     for sense in (1, -1):
         during = np.zeros(recording.frames, bool)
@@ -159,7 +159,7 @@ def _mean(value: np.ndarray, error: np.ndarray) -> tuple[float, float]:
     return float(value[good].mean()), float(np.sqrt((error[good] ** 2).sum()) / good.sum())
 
 
-def _flow(recording: Recording, motion: WallMotion, label: int) -> tuple[np.ndarray, np.ndarray]:
+def measured_flow(recording: Recording, motion: WallMotion, label: int) -> tuple[np.ndarray, np.ndarray]:
     """Volume flow (T,) that the measured velocities tell at the openings of a region, m^3/s, inwards; its error."""
     nodes = recording.grid.nodes()
     depth = _DEPTH * float(np.max(recording.grid.spacing))

@@ -36,7 +36,7 @@ def findings(recording: Recording, *, severe_only: bool = False) -> list[Finding
         severe_only: look only for what is refused, which is quick.
     """
     severe: tuple[Callable[[Recording], Iterator[Finding]], ...] = (_lengths, _times, _errors, bodies, mask_and_wall)
-    others = (_speeds, _fluid, _coverage, _valves, axis_order, wrapped_speeds, volumes, fluxes, wall_motion)
+    others = (_speeds, _fluid, _coverage, _regions, _valves, axis_order, wrapped_speeds, volumes, fluxes, wall_motion)
     found = [finding for check in (severe if severe_only else (*severe, *others)) for finding in check(recording)]
     kept = [finding for finding in found if finding.severe or not severe_only]
     return sorted(kept, key=lambda finding: not finding.severe)
@@ -136,6 +136,17 @@ def _coverage(recording: Recording) -> Iterator[Finding]:
     elif measured.any() and still.sum() > CLOSED * measured.sum():
         rule = f"is exactly 0 at {100 * still.sum() / measured.sum():.3g} % of the measured nodes"
         yield Finding("/velocity", rule, "take nodes without data out of /mask, or give them /weight 0")
+
+
+def _regions(recording: Recording) -> Iterator[Finding]:
+    if recording.wall is None:
+        return
+    present = set(np.unique(recording.wall.region).tolist())
+    leak = () if recording.valve_leak is None else recording.valve_leak[:, 0].astype(int).tolist()
+    named = [(flux.dataset, flux.region) for flux in recording.fluxes] + [("/valve/leak", region) for region in leak]
+    for dataset, region in named:
+        if region not in present:
+            yield Finding(dataset, f"is of region {region}, of which the wall has no face", "label it in /wall/region")
 
 
 def _valves(recording: Recording) -> Iterator[Finding]:

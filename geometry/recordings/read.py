@@ -11,10 +11,12 @@ import h5py
 import numpy as np
 
 from geometry.grids.grid import Grid
+from geometry.surfaces.integers import narrowed
 
 from .checks import refuse_implausible
 from .errors import RecordingError
 from .odd_files import brief, reading, refuse_oversized
+from .opening_flux import GROUP, fluxes_of, is_flux
 from .recording import LAYOUT, OF_A_WALL, REQUIRED, Recording, Wall
 from .rules import check_recording
 from .units import factor
@@ -30,6 +32,7 @@ QUANTITIES = {
     "/pressure": "pressure",
     "/wall/vertices": "length",
     "/wall/velocity": "velocity",
+    "/wall/sigma": "length",
 }
 SOFT_LINKS = 16  # a chain longer than this is a circle
 
@@ -115,12 +118,25 @@ def _datasets(file: h5py.File, source: str) -> dict[str, tuple[h5py.Dataset, typ
                 found[dataset] = _numbers(node, dataset, source), kind
         if node is None and dataset in REQUIRED:
             raise RecordingError(source, dataset, "is required but missing")
+    for dataset in _flux_names(file, source):
+        with reading(source, dataset):
+            node = _resolve(file, dataset, source)
+            if node is not None:
+                found[dataset] = _numbers(node, dataset, source), np.float64
     there = [dataset for dataset in found if dataset.startswith("/wall/")]
     for dataset in OF_A_WALL if there else ():
         if dataset not in found:
             rule = f"is required but missing, beside {there[0]}; or leave all of /wall out"
             raise RecordingError(source, dataset, rule)
     return found
+
+
+def _flux_names(file: h5py.File, source: str) -> list[str]:
+    """The datasets of measured fluxes that are there; other names under /flux are none of the format's, or fixed."""
+    with reading(source, GROUP):
+        group = _resolve(file, GROUP, source)
+        names = [f"{GROUP}/{name}" for name in group] if isinstance(group, h5py.Group) else []
+    return sorted(name for name in names if is_flux(name))
 
 
 def _outline(node: h5py.Dataset, dataset: str, kind: type, source: str) -> np.ndarray:
@@ -134,7 +150,7 @@ def _outline(node: h5py.Dataset, dataset: str, kind: type, source: str) -> np.nd
 def _built(file: h5py.File, grid: Grid, arrays: Mapping[str, np.ndarray], source: str) -> Recording:
     names = {dataset: name for name, dataset, _ in LAYOUT}
     wall: dict[str, Any] = {names[d].removeprefix("wall."): a for d, a in arrays.items() if d.startswith("/wall/")}
-    rest: dict[str, Any] = {names[d]: a for d, a in arrays.items() if not d.startswith("/wall/")}
+    rest: dict[str, Any] = {names[d]: a for d, a in arrays.items() if d in names and not d.startswith("/wall/")}
     numbers: dict[str, Any] = {name: _number(file, name, source) for name in ("rho", "mu")}
     period = _number(file, "period", source) if "period" in file.attrs else 0.0
     try:
@@ -143,6 +159,7 @@ def _built(file: h5py.File, grid: Grid, arrays: Mapping[str, np.ndarray], source
             wall=Wall(**wall) if wall else None,
             period=period,
             description=_text(file, "description", source),
+            fluxes=fluxes_of(arrays),
             **numbers,
             **rest,
         )
@@ -254,11 +271,12 @@ def _numbers(node: h5py.Group | h5py.Dataset | h5py.Datatype, dataset: str, sour
 
 
 def _load(node: h5py.Dataset, dataset: str, kind: type, source: str) -> np.ndarray:
-    values = _unpacked(node, np.asarray(node[()]), dataset, source)
-    if kind in (np.bool_, np.int32, np.uint8, np.int64):
-        _check_integers(values, dataset, kind, source)
-    with np.errstate(over="ignore"):  # a float64 too large for float32 becomes inf, which the rules then report
-        return values.astype(kind)
+    try:
+        return narrowed(_unpacked(node, np.asarray(node[()]), dataset, source), kind)
+    except RecordingError:
+        raise
+    except ValueError as fault:
+        raise RecordingError(source, dataset, str(fault)) from fault
 
 
 def _unpacked(node: h5py.Dataset, values: np.ndarray, dataset: str, source: str) -> np.ndarray:
@@ -283,13 +301,3 @@ def _unpacked(node: h5py.Dataset, values: np.ndarray, dataset: str, source: str)
     except ValueError as fault:
         raise RecordingError(source, dataset, f"its attribute units: {fault}") from fault
     return values if unit == 1 else values * unit
-
-
-def _check_integers(values: np.ndarray, dataset: str, kind: type, source: str) -> None:
-    """Refuse what a conversion to a narrower type would change without a word."""
-    lower, upper = (0, 1) if kind is np.bool_ else (np.iinfo(kind).min, np.iinfo(kind).max)
-    if values.size and not ((values >= lower) & (values <= upper)).all():
-        meaning = "0 and 1 only" if kind is np.bool_ else f"integers from {lower} to {upper}"
-        raise RecordingError(source, dataset, f"must hold {meaning}, not {values.min()} to {values.max()}")
-    if values.dtype.kind == "f" and (values != np.rint(values)).any():
-        raise RecordingError(source, dataset, "must hold integers")

@@ -14,9 +14,11 @@ from typing import Any
 import numpy as np
 
 from geometry.grids.grid import Grid
+from geometry.surfaces.integers import narrowed
 from geometry.surfaces.surface import Surface
 
 from .errors import RecordingError
+from .opening_flux import OpeningFlux, check_distinct
 
 # Field of `Recording` (after a dot: of its wall), dataset, type in memory and in the file.
 LAYOUT: tuple[tuple[str, str, type], ...] = (
@@ -33,7 +35,9 @@ LAYOUT: tuple[tuple[str, str, type], ...] = (
     ("wall.faces", "/wall/faces", np.int32),
     ("wall.region", "/wall/region", np.uint8),
     ("wall.velocity", "/wall/velocity", np.float32),
+    ("wall.sigma", "/wall/sigma", np.float32),
     ("valve_intervals", "/valve/intervals", np.float64),
+    ("valve_leak", "/valve/leak", np.float64),
     ("valve_open", "/valve_open", np.uint8),
     ("volume", "/volume", np.float64),
     ("flux_mitral", "/flux/mitral", np.float64),
@@ -56,12 +60,14 @@ class Wall:
         faces: (nf, D), vertex numbers, normals outwards.
         region: (nf,), 0 wall, 1 mitral inlet, 2 aortic outlet, further ones free.
         velocity: (T, nv, D), m/s, or None: it then follows from `vertices`.
+        sigma: (T, nv) or (nv,), m, standard deviation of a vertex's place; None: nothing is known of it.
     """
 
     vertices: np.ndarray
     faces: np.ndarray
     region: np.ndarray
     velocity: np.ndarray | None = None
+    sigma: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         _coerce(self, "wall.")
@@ -78,7 +84,9 @@ class Wall:
     def select(self, frames: slice | Sequence[int] | np.ndarray) -> Wall:
         """The wall at some of the frames."""
         vertices = self.vertices[frames] if self.moves else self.vertices
-        return replace(self, vertices=vertices, velocity=None if self.velocity is None else self.velocity[frames])
+        velocity = None if self.velocity is None else self.velocity[frames]
+        sigma = self.sigma if self.sigma is None or self.sigma.ndim == 1 else self.sigma[frames]
+        return replace(self, vertices=vertices, velocity=velocity, sigma=sigma)
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,10 +110,12 @@ class Recording:
         beam: (T, D, *shape) or (D, *shape), unit vectors along which alone the velocity was measured.
         pressure: (T, *shape), Pa, gauge.
         valve_intervals: (n, 3), rows (region, opens, closes), s.
+        valve_leak: (n, 2), rows (region, part of its area that stays open while it is shut).
         valve_open: (T, 2), regions 1 and 2 open at the frames; used where there are no intervals.
         volume: (T,), m^3.
         flux_mitral: (T,), m^3/s, positive into the ventricle.
         flux_aortic: (T,), m^3/s, likewise.
+        fluxes: measured fluxes of regions, with their errors.
 
     Raises:
         RecordingError: shapes that disagree; `geometry.check_recording` tests every rule of the format.
@@ -127,10 +137,12 @@ class Recording:
     beam: np.ndarray | None = None
     pressure: np.ndarray | None = None
     valve_intervals: np.ndarray | None = None
+    valve_leak: np.ndarray | None = None
     valve_open: np.ndarray | None = None
     volume: np.ndarray | None = None
     flux_mitral: np.ndarray | None = None
     flux_aortic: np.ndarray | None = None
+    fluxes: tuple[OpeningFlux, ...] = ()
 
     def __post_init__(self) -> None:
         _coerce(self, "")
@@ -138,6 +150,7 @@ class Recording:
             object.__setattr__(self, name, float(getattr(self, name)))
         if self.mask.shape == self.grid.shape:
             object.__setattr__(self, "mask", np.broadcast_to(self.mask, (len(self.time), *self.grid.shape)))
+        check_distinct(self.fluxes)
         _check_shapes(self)
 
     @property
@@ -157,6 +170,8 @@ class Recording:
             value = getattr(self.wall, name[5:], None) if name.startswith("wall.") else getattr(self, name)
             if value is not None:
                 found[dataset] = value
+        for flux in self.fluxes:
+            found |= flux.arrays()
         return found
 
     def check(self, source: str = "recording") -> None:
@@ -192,9 +207,10 @@ class Recording:
         """
         chosen = np.arange(self.frames)[frames if isinstance(frames, slice) else np.asarray(frames)]
         changes: dict[str, Any] = {"wall": None if self.wall is None else self.wall.select(chosen)}
+        changes["fluxes"] = tuple(flux.select(chosen) for flux in self.fluxes)
         for name, _, _ in LAYOUT:
             value = None if name.startswith("wall.") else getattr(self, name)
-            still = name == "valve_intervals" or (
+            still = name in ("valve_intervals", "valve_leak") or (
                 name == "beam" and value is not None and value.ndim == self.dimension + 1
             )
             if value is not None and not still:
@@ -217,7 +233,7 @@ class Recording:
         gone: dict[str, Any] = dict.fromkeys(("weight", "beam", "pressure", "flux_mitral", "flux_aortic"))
         text = self.description if description is None else description
         new: dict[str, Any] = {"velocity": velocity, "sigma": sigma, "uncovered": uncovered, "quality": quality}
-        return replace(self, **new, description=text, **gone)
+        return replace(self, **new, description=text, fluxes=(), **gone)
 
     def valve_intervals_or_derived(self) -> np.ndarray:
         """Rows (region, opens, closes), `(n, 3)`, s: `/valve/intervals`, or else derived from `/valve_open`.
@@ -243,10 +259,15 @@ class Recording:
 def _coerce(instance: Wall | Recording, prefix: str) -> None:
     """Bring every array to its type; a recording keeps no reference to lists or other array types."""
     kinds = {name.removeprefix(prefix): kind for name, _, kind in LAYOUT if name.startswith(prefix)}
+    datasets = {name.removeprefix(prefix): dataset for name, dataset, _ in LAYOUT if name.startswith(prefix)}
     for item in fields(instance):
         value = getattr(instance, item.name)
         if item.name in kinds and value is not None:
-            object.__setattr__(instance, item.name, np.asarray(value, dtype=kinds[item.name]))
+            try:
+                array = narrowed(value, kinds[item.name])
+            except ValueError as fault:
+                raise RecordingError("recording", datasets[item.name], str(fault)) from fault
+            object.__setattr__(instance, item.name, array)
 
 
 def _check_shapes(recording: Recording) -> None:
@@ -264,7 +285,7 @@ def _check_shapes(recording: Recording) -> None:
 def _allowed_shapes(recording: Recording) -> dict[str, tuple[tuple[int, ...], ...]]:
     """The shapes that each dataset may have, given the frames, the grid and the size of the wall."""
     frames, dimension, shape = recording.time.shape[0], recording.grid.dimension, recording.grid.shape
-    intervals = recording.valve_intervals
+    intervals, leak = recording.valve_intervals, recording.valve_leak
     return {
         "/velocity": ((frames, dimension, *shape),),
         "/mask": ((frames, *shape),),
@@ -276,10 +297,12 @@ def _allowed_shapes(recording: Recording) -> dict[str, tuple[tuple[int, ...], ..
         "/pressure": ((frames, *shape),),
         **({} if recording.wall is None else _allowed_wall_shapes(recording.wall, frames, dimension)),
         "/valve/intervals": ((len(intervals) if intervals is not None and intervals.ndim else 0, 3),),
+        "/valve/leak": ((len(leak) if leak is not None and leak.ndim else 0, 2),),
         "/valve_open": ((frames, 2),),
         "/volume": ((frames,),),
         "/flux/mitral": ((frames,),),
         "/flux/aortic": ((frames,),),
+        **{dataset: ((frames,),) for flux in recording.fluxes for dataset in flux.arrays()},
     }
 
 
@@ -291,4 +314,5 @@ def _allowed_wall_shapes(wall: Wall, frames: int, dimension: int) -> dict[str, t
         "/wall/faces": ((faces, dimension),),
         "/wall/region": ((faces,),),
         "/wall/velocity": ((frames, *points),),
+        "/wall/sigma": ((frames, points[0]), points[:1]),
     }

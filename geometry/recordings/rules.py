@@ -177,6 +177,9 @@ def _wall(recording: Recording, source: str) -> None:
     if wall.vertices.size and np.abs(wall.vertices).max() > LONGEST:
         rule = f"reaches {np.abs(wall.vertices).max():g} m, farther than {LONGEST:g} m from 0; give it in metres"
         raise RecordingError(source, "/wall/vertices", rule)
+    if wall.sigma is not None and not ((wall.sigma >= 0) & (wall.sigma <= LONGEST)).all():
+        rule = "is the standard deviation of a vertex's place in m: finite, and not negative"
+        raise RecordingError(source, "/wall/sigma", rule)
     if len(wall.faces) == 0:
         raise RecordingError(source, "/wall/faces", "holds no face, so there is no surface around the blood")
     try:
@@ -228,6 +231,18 @@ def _valves(recording: Recording, source: str) -> None:
             raise RecordingError(source, "/valve/intervals", rule)
     if recording.valve_open is not None and (recording.valve_open > 1).any():
         raise RecordingError(source, "/valve_open", "must hold 0 (closed) and 1 (open) only")
+    if recording.valve_leak is not None:
+        _leak(recording.valve_leak, source)
+
+
+def _leak(leak: np.ndarray, source: str) -> None:
+    label, part = leak.T
+    if not ((label == np.rint(label)) & (label >= 1)).all() or len(np.unique(label)) < len(label):
+        rule = f"its first column must hold region labels 1, 2, ..., each once, not {label}"
+        raise RecordingError(source, "/valve/leak", rule)
+    if not ((part >= 0) & (part < 1)).all():
+        rule = f"must hold the part of a shut valve's area that stays open, from 0 to below 1, not {part}"
+        raise RecordingError(source, "/valve/leak", rule)
 
 
 def _series(recording: Recording, source: str) -> None:
@@ -235,6 +250,8 @@ def _series(recording: Recording, source: str) -> None:
         values = recording.arrays().get(dataset)
         if values is not None and not np.isfinite(values).all():
             raise RecordingError(source, dataset, "must be finite at every frame")
+    for flux in recording.fluxes:
+        flux.check(source)
     if recording.uncovered is not None and (recording.uncovered < 0).any():
         raise RecordingError(source, "/uncovered", "counts nodes and must not be negative")
 

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import errno
 import os
+import shutil
 import stat
 import tempfile
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 _PIECE = 1 << 30  # bytes of one call; Linux takes no more than 2 GiB
@@ -59,6 +61,67 @@ def _place(path: Path, content: bytes | memoryview) -> None:
         raise
 
 
+def move_together(files: Sequence[Path], folder: Path) -> None:
+    """Move finished files into a folder, all of them or none.
+
+    Each is flushed to the disk before the first is moved; where a step fails, files that were replaced come back.
+
+    Args:
+        files: on the same file system as the folder, in another one that is the caller's alone.
+        folder: where they go, under their names; a file of that name is replaced.
+
+    Raises:
+        FileExistsError: something other than a regular file has one of the names; nothing was moved.
+        OSError: a file could not be flushed or moved; the folder is as it was.
+    """
+    for file in files:
+        refuse_special(folder / file.name)
+    for file in files:
+        _flush(file)
+    moved: list[tuple[Path, Path | None]] = []
+    try:
+        for file in files:
+            target, older = folder / file.name, file.with_name(f".{file.name[:100]}.older")
+            if target.exists():
+                os.rename(target, older)
+                moved.append((target, older))
+            else:
+                moved.append((target, None))
+            os.replace(file, target)
+        _flush_folder(folder)
+    except BaseException:
+        for target, earlier in reversed(moved):
+            with suppress(OSError):  # the first fault is the one to tell
+                if earlier is not None:
+                    os.replace(earlier, target)
+                else:
+                    os.unlink(target)
+        raise
+    for _, earlier in moved:
+        if earlier is not None:
+            with suppress(OSError):  # the caller's folder goes away with it
+                os.unlink(earlier)
+
+
+@contextmanager
+def written_together(folder: Path) -> Iterator[Path]:
+    """A scratch folder whose files move into `folder` together when the block ends well, and vanish otherwise.
+
+    Args:
+        folder: an existing one, where the files are wanted.
+
+    Raises:
+        FileExistsError: something other than a regular file has one of their names.
+        OSError: a step failed; the folder is as it was.
+    """
+    scratch = Path(tempfile.mkdtemp(prefix=".files-", dir=folder))
+    try:
+        yield scratch
+        move_together(sorted(scratch.iterdir()), folder)
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
+
+
 def refuse_special(path: str | Path) -> None:
     """Refuse a name that a rename would take from a link, a device, a pipe or a folder.
 
@@ -86,6 +149,14 @@ def _write(handle: int, content: memoryview) -> None:
         if taken <= 0:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         rest = rest[taken:]
+
+
+def _flush(file: Path) -> None:
+    handle = os.open(file, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
 
 
 def _flush_folder(folder: Path) -> None:

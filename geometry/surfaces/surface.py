@@ -14,6 +14,7 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from .integers import narrowed
 from .winding import winding_number
 
 if TYPE_CHECKING:
@@ -45,8 +46,10 @@ class Surface:
 
     def __post_init__(self) -> None:
         vertices = np.ascontiguousarray(self.vertices, dtype=np.float64)
-        faces = np.ascontiguousarray(self.faces, dtype=np.int32)
-        region = np.zeros(len(faces), np.uint8) if self.region is None else np.ascontiguousarray(self.region, np.uint8)
+        faces = np.ascontiguousarray(_narrowed("faces", self.faces, np.int32))
+        region = np.zeros(len(faces), np.uint8)
+        if self.region is not None:
+            region = np.ascontiguousarray(_narrowed("region", self.region, np.uint8))
         if vertices.ndim != 2 or vertices.shape[1] not in (2, 3):
             raise SurfaceError(f"vertices must be (nv, 2) or (nv, 3), not {vertices.shape}")
         if faces.ndim != 2 or faces.shape[1] != vertices.shape[1] or len(faces) == 0:
@@ -246,3 +249,10 @@ def unit(vectors: np.ndarray) -> np.ndarray:
     """Vectors `(..., D)` divided by their length; zero stays zero."""
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     return np.divide(vectors, length, out=np.zeros_like(vectors), where=length > 0)
+
+
+def _narrowed(name: str, values: object, kind: type) -> np.ndarray:
+    try:
+        return narrowed(values, kind)
+    except ValueError as fault:
+        raise SurfaceError(f"{name} {fault}") from fault

@@ -1,5 +1,6 @@
 """The tensor-product knot grid: where a point falls, which coefficients it touches, with which values."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import reduce
@@ -9,6 +10,8 @@ import torch
 from regularize.errors import InvalidInput
 
 from .bspline import DEGREES, basis
+
+MOST_NODES = 2**31 - 1  # places of coefficients are int32 in compiled code
 
 
 @dataclass(frozen=True)
@@ -30,10 +33,17 @@ class Knots:
             raise InvalidInput(f"degree is {self.degree}: it must be one of {DEGREES}")
         if not len(self.origin) == len(self.spacing) == len(self.cells):
             raise InvalidInput("origin, spacing and cells must have one entry per axis")
-        if min(self.spacing) <= 0:
-            raise InvalidInput(f"spacing is {self.spacing}: knot distances must be positive")
+        if not all(0 < step < math.inf for step in self.spacing) or not all(map(math.isfinite, self.origin)):
+            raise InvalidInput(
+                f"spacing is {self.spacing}, origin {self.origin}: knot distances must be positive, and all finite"
+            )
         if min(self.cells) < 1:
             raise InvalidInput(f"cells is {self.cells}: at least one interval per axis is needed")
+        if self.nodes > MOST_NODES:
+            raise InvalidInput(
+                f"knots of {self.spacing} in {self.cells} cells ask for {self.nodes:.2g} unknowns, more than int32 can "
+                "number: give a larger knot distance (it is in m)"
+            )
 
     @classmethod
     def covering(

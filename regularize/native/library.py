@@ -28,8 +28,12 @@ from regularize.rows.operators import (
 from regularize.rows.ordering import Ordering
 
 from . import build, loader
+from .checks import check_array, check_band, check_sizes, check_slots
+from .faults import raise_faults
 
 FAMILY = loader.Family(build.LIBRARIES, build.STEM, "spline_runs", "regularize.native.build")
+GUARDED = ("gram", "gradient", "sort", "factor_f64", "factor_f32", "solve_f64", "solve_f32")
+CURE = "use wider knots, or fewer frames at once"
 KINDS = {VectorRows: 0, DirectionRows: 1, DivergenceRows: 2}
 
 
@@ -70,9 +74,14 @@ def library() -> ctypes.CDLL | None:
     """
     if not FAMILY.path("baseline").is_file():
         return None
-    handle = loader.choose(FAMILY).handle
+    found = loader.choose(FAMILY)
+    handle = found.handle
     for name in ("gram", "gradient", "sort", "set_threads", "solve_f64", "solve_f32"):
         getattr(handle, f"spline_{name}").restype = None
+    try:
+        raise_faults(handle, "spline_fault", {f"spline_{name}": CURE for name in GUARDED})
+    except AttributeError as fault:
+        raise loader.LibraryMissing(loader.outdated(FAMILY, found.instruction_set)) from fault
     return handle
 
 
@@ -100,6 +109,7 @@ def _size(band: torch.Tensor) -> tuple[ctypes.c_void_p, ctypes.c_int64, ctypes.c
 def factorise(band: torch.Tensor, reach: torch.Tensor) -> bool:
     """As :func:`regularize.cholesky.factorise`."""
     lib = _loaded()
+    check_band(band, reach)
     lib.spline_set_threads(torch.get_num_threads())
     run = lib.spline_factor_f64 if band.dtype == torch.float64 else lib.spline_factor_f32
     return bool(run(*_size(band), _address(reach)))
@@ -107,7 +117,14 @@ def factorise(band: torch.Tensor, reach: torch.Tensor) -> bool:
 
 def solve(band: torch.Tensor, reach: torch.Tensor, right: torch.Tensor, *, lower: bool, upper: bool) -> torch.Tensor:
     """x (n, k) with L x = right, L' x = right or, with both, L L' x = right for the factor L in the band."""
-    lib, x = _loaded(), right.T.contiguous().clone()
+    lib = _loaded()
+    check_band(band, reach)
+    if right.ndim != 2 or right.device != band.device or right.dtype != band.dtype or len(right) != len(band):
+        raise InvalidInput(
+            f"the right-hand side is {tuple(right.shape)} of {right.dtype} on '{right.device}': it must be "
+            f"({len(band)}, k) of {band.dtype} on '{band.device}', as the factor"
+        )
+    x = right.T.contiguous().clone()
     lib.spline_set_threads(torch.get_num_threads())
     run = lib.spline_solve_f64 if band.dtype == torch.float64 else lib.spline_solve_f32
     parts = ctypes.c_int32(lower + 2 * upper)
@@ -123,6 +140,7 @@ class PackedSystem:
 
     def __init__(self, system: System, ordering: Ordering) -> None:
         self.system, self.ordering, self.lib = system, ordering, _loaded()
+        check_sizes(system, ordering)
         self._keep: list[object] = []
         self.slabs = ordering.slabs().contiguous()
         knots, tile = ordering.knots, self.lib.spline_tile_width()
@@ -174,7 +192,9 @@ class PackedSystem:
     def gradient(self, x: torch.Tensor | None) -> torch.Tensor:
         """A'(b - A x) - damping^2 x; A'b where x is None. x and the result (active, C) in solve order."""
         out = torch.zeros(self.grid.nodes, self.grid.components, dtype=torch.float64)
-        x = None if x is None else x.contiguous()
+        if x is not None:
+            x = x.contiguous()
+            check_array("x", x, torch.float64, (self.grid.nodes, self.grid.components))
         self.lib.spline_set_threads(torch.get_num_threads())
         for block, rows, index in zip(self.system.blocks, self.rows, self.sorted, strict=True):
             if isinstance(block, CellRows):
@@ -183,6 +203,9 @@ class PackedSystem:
                 continue
             # divergence rows have no target and add nothing to the right-hand side
             target = None if isinstance(block, DivergenceRows) else block.target.double().contiguous()
+            if target is not None:
+                width = self.grid.components if isinstance(block, VectorRows) else 1
+                check_array("the target of a block", target, torch.float64, (len(index) * width,))
             if x is not None or target is not None:
                 given = (_address(each) for each in (target, index, x, out))
                 slabs = _address(self.slabs), ctypes.c_int64(len(self.slabs) - 1)
@@ -196,7 +219,7 @@ class PackedSystem:
         out.index_add_(0, near.flatten(), pulled.view(-1, block.components), alpha=-1.0)
 
     def _pack(self, block: RowBlock) -> _Rows:
-        slot, cells = self.ordering.slots(block.cell).contiguous(), len(self.ordering.keys)
+        slot, cells = check_slots(self.ordering, block.cell), len(self.ordering.keys)
         index, start = torch.empty_like(slot), torch.empty(cells + 1, dtype=torch.int64)
         sizes = ctypes.c_int64(len(slot)), ctypes.c_int64(cells)
         self.lib.spline_sort(_address(slot), *sizes, _address(index), _address(start))

@@ -5,6 +5,7 @@ and back; blocks are stacked by :class:`System` into the matrix of Grønli 2017,
 are scaled: a row of weight w contributes w^2 to the cost (our reading of Grønli 2017, eq. 3.10 and eq. 3.16).
 """
 
+import math
 from collections.abc import Iterator, Sequence
 from functools import reduce
 from typing import Protocol
@@ -54,6 +55,10 @@ class PointRows:
     def __init__(self, knots: Knots, points: torch.Tensor, components: int) -> None:
         if points.ndim != 2 or points.shape[1] != knots.axes:
             raise InvalidInput(f"points have shape {tuple(points.shape)}: expected (n, {knots.axes})")
+        if not points.is_floating_point() or points.device.type == "meta":
+            raise InvalidInput(f"points are of {points.dtype} on '{points.device}': expected real coordinates, m")
+        if not bool(torch.isfinite(points).all()):
+            raise InvalidInput("points must be finite: leave out those that are not")
         self.knots, self.components = knots, components
         self.cell, self.t = knots.locate(points)
 
@@ -80,6 +85,8 @@ class VectorRows(PointRows):
     """Rows w_ik v_k(x_i) = w_ik target_ik, one per point and component (the matrix S of Grønli 2017, eq. 3.7)."""
 
     def __init__(self, knots: Knots, points: torch.Tensor, target: torch.Tensor, weight: torch.Tensor) -> None:
+        if target.ndim != 2 or len(target) != len(points):
+            raise InvalidInput(f"target has the shape {tuple(target.shape)}: it must be ({len(points)}, C)")
         super().__init__(knots, points, target.shape[1])
         self.weight = weight.expand(target.shape)
         self.target = (self.weight * target).flatten()
@@ -187,6 +194,11 @@ class DirectionRows(_CoupledRows):
         target: torch.Tensor,
         weight: torch.Tensor,
     ) -> None:
+        if direction.ndim != 2 or len(direction) != len(points) or target.shape != points[:, 0].shape:
+            raise InvalidInput(
+                f"directions of the shape {tuple(direction.shape)} and targets of {tuple(target.shape)}: they must be "
+                f"({len(points)}, C) and ({len(points)},)"
+            )
         super().__init__(knots, points, direction.shape[1], target, weight)
         self.direction = direction
 
@@ -216,6 +228,12 @@ class CellRows:
     """
 
     def __init__(self, knots: Knots, cells: torch.Tensor, factor: torch.Tensor, components: int) -> None:
+        tail = () if factor.ndim == 2 else (components,)
+        if factor.shape[1:] != (knots.local_size, *tail):
+            raise InvalidInput(
+                f"factor has the shape {tuple(factor.shape)}: it must be (rows, {knots.local_size}), or with "
+                f"a last axis of the {components} components"
+            )
         self.knots, self.cell, self.components = knots, cells, components
         self.factor = factor
         self.coupled = factor.ndim == 3
@@ -251,6 +269,14 @@ class System:
     def __init__(self, knots: Knots, components: int, blocks: Sequence[RowBlock], damping: float) -> None:
         if not blocks:
             raise InvalidInput("the system has no rows: give samples, walls or penalties")
+        if components < 1 or not 0 <= damping < math.inf:
+            raise InvalidInput(
+                f"a system needs a component and a finite damping from 0 on, got {components}, {damping}"
+            )
+        if not any(len(block.cell) for block in blocks):
+            raise InvalidInput("the system has blocks without any row: give samples, walls or penalties")
+        for block in blocks:
+            _check_block(block, knots, components, blocks[0].cell.device)
         self.knots, self.components = knots, components
         self.blocks, self.damping = list(blocks), float(damping)
         self._sizes = [len(block.target) for block in self.blocks]
@@ -293,3 +319,35 @@ class System:
     def cells(self) -> torch.Tensor:
         """Sorted flat numbers of the cells that hold rows."""
         return torch.unique(torch.cat([self.knots.cell_number(block.cell) for block in self.blocks]))
+
+
+def _check_block(block: RowBlock, knots: Knots, components: int, device: torch.device) -> None:
+    """Refuse rows that do not belong to a system, or lie in cells that its knots do not have.
+
+    Args:
+        block: the rows.
+        knots: of the system.
+        components: of the system.
+        device: of its other rows.
+
+    Raises:
+        InvalidInput: they differ in knots, components or device, their cells are out of range, or a target is not
+            finite.
+    """
+    name = type(block).__name__
+    if block.knots != knots:
+        raise InvalidInput(f"{name} were made for other knots than the system's: {block.knots}, not {knots}")
+    if block.components != components:
+        raise InvalidInput(f"{name} are of {block.components} components, the system of {components}")
+    if block.cell.device != device or block.target.device != device or device.type == "meta":
+        devices = f"'{block.cell.device}' and '{block.target.device}'"
+        raise InvalidInput(f"{name} are on {devices}: all rows must hold their numbers on one device, here '{device}'")
+    if not bool(torch.isfinite(block.target).all()):
+        raise InvalidInput(f"{name} have a target or weight that is not finite: leave such samples out")
+    if block.cell.numel():
+        least, most = torch.aminmax(block.cell, dim=0)
+        if bool((least < 0).any()) or any(int(last) >= n for last, n in zip(most, knots.cells, strict=True)):
+            raise InvalidInput(
+                f"{name} lie in cells {least.tolist()} to {most.tolist()}, but those of the knots run from 0 to "
+                f"{[n - 1 for n in knots.cells]}"
+            )

@@ -6,6 +6,7 @@ from scipy.linalg.blas import dtbmv
 
 from regularize.errors import InvalidInput
 from regularize.native import library as native
+from regularize.native.checks import check_band
 from regularize.rows.ordering import Ordering
 
 from . import cholesky
@@ -20,9 +21,16 @@ class Factor:
     """
 
     def __init__(self, band: torch.Tensor, ordering: Ordering) -> None:
+        active = len(ordering.nodes)
+        if band.ndim != 2 or len(band) == 0 or len(band) % active:
+            raise InvalidInput(
+                f"the band has the shape {tuple(band.shape)}: it must have a row for each component of the {active} "
+                "coefficients of its ordering"
+            )
         self.ordering, self.band = ordering, band
-        self.reach = ordering.reach(len(band) // len(ordering.nodes))
-        self._algebra = native if native.available() and band.is_contiguous() else cholesky
+        self.reach = ordering.reach(len(band) // active)
+        check_band(band, self.reach)
+        self._algebra = native if native.available() else cholesky
         if not self._algebra.factorise(band, self.reach):
             raise InvalidInput(
                 "the normal matrix is not positive definite: some coefficients are fixed by no row; give a "
@@ -31,6 +39,11 @@ class Factor:
 
     def solve(self, right: torch.Tensor) -> torch.Tensor:
         """(active, C) or (active, C, k) in solve order -> the same shape."""
+        if right.device != self.band.device or right.ndim == 0 or right.numel() % len(self.band):
+            raise InvalidInput(
+                f"the right-hand side has the shape {tuple(right.shape)} on '{right.device}': it must hold columns of "
+                f"{len(self.band)} numbers on '{self.band.device}'"
+            )
         flat = right.reshape(len(self.band), -1).to(self.band.dtype)
         solved = self._algebra.solve(self.band, self.reach, flat, lower=True, upper=True)
         return solved.double().view(right.shape)

@@ -7,6 +7,7 @@ import torch
 from regularize.errors import InvalidInput
 from regularize.native import gram_triton
 from regularize.native import library as native
+from regularize.native.checks import fits
 from regularize.rows.assembly import reference_band
 from regularize.rows.operators import System
 from regularize.rows.ordering import Ordering, order
@@ -33,13 +34,13 @@ class PreparedSystem:
         device = self.ordering.nodes.device
         if engine == "triton" and not gram_triton.available(device):
             raise InvalidInput(f"engine is 'triton', which cannot run on {device} here; use 'reference'")
-        self.engine = engine or self._fastest(device)
+        self.engine = engine or self._fastest(device, system)
         self._packed = native.PackedSystem(system, self.ordering) if self.engine == "native" else None
 
     @staticmethod
-    def _fastest(device: torch.device) -> str:
+    def _fastest(device: torch.device, system: System) -> str:
         if device.type == "cpu":
-            return "native" if native.available() else "reference"
+            return "native" if native.available() and fits(system) else "reference"
         return "triton" if gram_triton.available(device) else "reference"
 
     def with_targets(self, system: System) -> "PreparedSystem":

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import pickle
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -37,8 +38,14 @@ def _full(box_recording: Callable[..., Recording]) -> Recording:
         "volume": [1e-6, 1e-6, 1e-6],
         "flux_mitral": [0.0, 1e-6, 0.0],
         "flux_aortic": [0.0, 0.0, -1e-6],
+        "valve_leak": [[1, 0.05]],
+        "fluxes": (
+            geometry.OpeningFlux(1, [1e-6, 2e-6, 0.0], [1e-7, 2e-7, 1e-7]),
+            geometry.OpeningFlux(12, [0.0, -1e-6, 0.0]),
+        ),
     }
     wanted = {name: getattr(plain, name) for name in ("time", "grid", "velocity", "mask", "wall", "rho", "mu")}
+    wanted["wall"] = replace(plain.wall, sigma=draw.uniform(0, 1e-3, plain.wall.vertices.shape[:2]))
     return Recording(**wanted, **extra, period=0.0, description="a box")
 
 
@@ -162,6 +169,7 @@ def _in_millimetres(file: h5py.File) -> None:
 
 
 def _unused_vertex(file: h5py.File) -> None:
+    del file["wall/sigma"]
     for name, value in (("vertices", 0.5), ("velocity", 0.0)):
         values = file[f"wall/{name}"][()]
         del file[f"wall/{name}"]
@@ -191,6 +199,15 @@ RULES: list[tuple[str, Callable[[h5py.File], None], str]] = [
     ("valve_open shape", _replace("valve_open", lambda v: v[:, :1]), "/valve_open: has the shape"),
     ("volume shape", _replace("volume", lambda v: v[:2]), "/volume: has the shape"),
     ("flux shape", _replace("flux/mitral", lambda v: v[:2]), "/flux/mitral: has the shape"),
+    ("region flux shape", _replace("flux/region_1", lambda v: v[:2]), "/flux/region_1: has the shape"),
+    ("region flux NaN", _set("flux/region_1", (0,), np.nan), "/flux/region_1: must be finite"),
+    ("region flux error", _set("flux/region_1_sigma", (0,), -1.0), "/flux/region_1_sigma: .*must not be negative"),
+    ("error alone", _remove("flux/region_1"), "/flux/region_1_sigma: is the deviation of /flux/region_1, .*missing"),
+    ("wall error shape", _replace("wall/sigma", lambda v: v[:, :2]), "/wall/sigma: has the shape"),
+    ("wall error negative", _set("wall/sigma", (0, 0), -1.0), "/wall/sigma: is the standard deviation"),
+    ("leak shape", _replace("valve/leak", lambda v: v[0]), "/valve/leak: has the shape"),
+    ("leak of the wall", _set("valve/leak", (0, 0), 0.0), "/valve/leak: its first column must hold region labels"),
+    ("all of it leaks", _set("valve/leak", (0, 1), 1.0), "/valve/leak: must hold the part of a shut valve's area"),
     ("velocity NaN", _set("velocity", INSIDE, np.nan), "/velocity: must be finite inside the mask"),
     ("sigma inf", _set("sigma", INSIDE, np.inf), "/sigma: must be finite inside the mask"),
     ("sigma negative", _set("sigma", INSIDE, -1.0), "/sigma: .*must not be negative"),
@@ -387,6 +404,9 @@ def test_select_takes_frames_of_everything(full: Recording) -> None:
             "/wall/vertices",
             "/valve_open",
             "/volume",
+            "/wall/sigma",
+            "/flux/region_1_sigma",
+            "/flux/region_12",
         ):
             np.testing.assert_array_equal(part.arrays()[dataset], full.arrays()[dataset][1:])
         np.testing.assert_array_equal(part.beam, full.beam)
@@ -398,9 +418,30 @@ def test_with_velocity_drops_what_described_the_old_velocity(full: Recording) ->
     assert other.description == "analysis" and other.uncovered.tolist() == [1, 1, 1]
     for name in ("weight", "sigma", "beam", "pressure", "flux_mitral", "flux_aortic"):
         assert getattr(other, name) is None
+    assert other.fluxes == ()
     np.testing.assert_array_equal(other.volume, full.volume)
     with pytest.raises(RecordingError, match="/velocity: has the shape"):
         full.with_velocity(full.velocity[:1])
+
+
+def test_files_without_measured_fluxes_have_none_and_other_names_under_flux_are_left_alone(path: Path) -> None:
+    with h5py.File(path, "r+") as file:
+        for name in ("region_1", "region_1_sigma", "region_12"):
+            del file["flux"][name]
+        file["flux/region_0"], file["flux/region_999"], file["flux/regional"] = [1.0], [1.0], [1.0]
+        del file["wall/sigma"], file["valve/leak"]
+    plain = read_recording(path)
+    assert plain.fluxes == () and plain.wall.sigma is None and plain.valve_leak is None
+    assert set(plain.arrays()) & {"/flux/region_0", "/flux/region_999", "/valve/leak", "/wall/sigma"} == set()
+
+
+def test_a_flux_without_a_deviation_is_off_by_a_tenth_of_its_rms(full: Recording) -> None:
+    np.testing.assert_allclose(full.fluxes[1].deviation, 0.1 * 1e-6 / np.sqrt(3))
+    np.testing.assert_array_equal(full.fluxes[0].deviation, full.fluxes[0].sigma)
+    with pytest.raises(RecordingError, match="/flux/region_0: names no opening"):
+        geometry.OpeningFlux(0, [1.0])
+    with pytest.raises(RecordingError, match="/flux/region_1: is given twice"):
+        replace(full, fluxes=(full.fluxes[0], full.fluxes[0]))
 
 
 def test_valve_changes_are_derived_midway_between_frames(box_recording: Callable) -> None:

@@ -5,10 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import torch
 
 import geometry
 from geometry.recordings.whole_file import refuse_special
+from torchsph.methods.measurement.informative import refuse_exact, refuse_silent
+from torchsph.simulator.state.checks import usable_device as known_device
 
 
 def full_vectors(recording: geometry.Recording, path: str | Path) -> geometry.Recording:
@@ -21,17 +22,20 @@ def full_vectors(recording: geometry.Recording, path: str | Path) -> geometry.Re
     return recording
 
 
+def informative(recording: geometry.Recording, path: str | Path, *, weighed: bool = True) -> geometry.Recording:
+    """The recording, refused by its path where nothing was measured or, if it is `weighed`, an error is stated as 0."""
+    refuse_silent(recording, str(path))
+    if weighed:
+        refuse_exact(recording, str(path))
+    return recording
+
+
 def usable_device(name: str) -> str:
     """The name of a device, refused where this machine has none of it."""
     try:
-        device = torch.device(name)
-    except RuntimeError:
-        raise ValueError(f"--device: unknown device '{name}'; use cpu, cuda or cuda:N") from None
-    if device.type not in ("cpu", "cuda"):
-        raise ValueError(f"--device: '{name}' is not supported; use cpu, cuda or cuda:N")
-    if device.type == "cuda" and (device.index or 0) >= torch.cuda.device_count():
-        raise ValueError(f"--device: this machine has no '{name}' that torch {torch.__version__} can use; use cpu")
-    return name
+        return known_device(name)
+    except ValueError as fault:
+        raise ValueError(f"--device: {fault}") from fault
 
 
 def check_spacing(spacing: float | None, recording: geometry.Recording) -> None:

@@ -35,7 +35,8 @@ def exit_code(fault: BaseException) -> ExitCode:
 def _allocation(fault: BaseException) -> bool:
     """Whether torch found no memory: it has no type of its own for that on the CPU."""
     words = str(fault).lower()
-    return isinstance(fault, RuntimeError) and ("can't allocate memory" in words or "out of memory" in words)
+    known = ("can't allocate memory", "out of memory", "storage size calculation overflowed")
+    return isinstance(fault, RuntimeError) and any(part in words for part in known)
 
 
 def _numerical(fault: BaseException) -> bool:

@@ -44,13 +44,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _failed(fault: BaseException, args: argparse.Namespace | None) -> int:
     """Tell a fault in one line, and return its code."""
+    from .cures import late_fault
     from .exit_codes import ExitCode, exit_code
     from .running import notes
 
     if os.environ.get(DEBUG):
         traceback.print_exc()
     code = exit_code(fault)
-    text = _text(fault, code is ExitCode.OURS)
+    text = late_fault(fault, code, args) or _text(fault, code is ExitCode.OURS)
     if code is ExitCode.RESUME:
         text += f"; run it again{' with --resume' if hasattr(args, 'resume') else ''} to go on"
     notes.fault("" if args is None else args.command, text, int(code), args)
@@ -62,6 +63,4 @@ def _text(fault: BaseException, ours: bool) -> str:
         return "interrupted"
     if isinstance(fault, OSError) and fault.filename is not None and fault.strerror:
         return f"{fault.filename}: {fault.strerror}"
-    if isinstance(fault, MemoryError) and not str(fault):
-        return "out of memory; try fewer --members or a larger --spacing"
     return f"{type(fault).__name__}: {fault} ({DEBUG}=1 shows where)" if ours else str(fault)

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from geometry.recordings.whole_file import refuse_special
+from geometry.recordings.whole_file import move_together, refuse_special, write_whole
 
 __all__ = ["output_folder", "staged", "write_json"]
 
@@ -51,7 +51,7 @@ def staged(folder: str | Path) -> Iterator[Path]:
     """A scratch folder whose files move into `folder` when the block ends well, and vanish otherwise.
 
     Scratch folders of runs that were killed are removed first. A file never takes the place of a link, a device or a
-    folder: `FileExistsError` before any file has moved.
+    folder: `FileExistsError` before any file has moved. Where a file cannot be moved, those before it are taken back.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
@@ -59,11 +59,7 @@ def staged(folder: str | Path) -> Iterator[Path]:
     scratch, lock = _locked_scratch(folder)
     try:
         yield scratch
-        files = sorted(scratch.iterdir())
-        for file in files:
-            refuse_special(folder / file.name)
-        for file in files:
-            os.replace(file, folder / file.name)
+        move_together(sorted(scratch.iterdir()), folder)
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
         os.close(lock)
@@ -97,7 +93,7 @@ def _sweep(folder: Path) -> None:
 
 def write_json(path: str | Path, content: Any) -> None:
     """Strict JSON: arrays become lists, and what is not finite becomes `null`, which every reader takes."""
-    Path(path).write_text(json.dumps(_plain(content), indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    write_whole(path, (json.dumps(_plain(content), indent=1, allow_nan=False) + "\n").encode())
 
 
 def _plain(value: Any) -> Any:

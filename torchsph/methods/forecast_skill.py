@@ -17,6 +17,7 @@ from torchsph.evaluation.frames import frame_at
 from torchsph.simulator.failures import NumericalFailure
 from torchsph.simulator.grid_forecast import GridForecast, Transfer
 from torchsph.simulator.simulator import Simulator
+from torchsph.simulator.transfer.checks import check_grid
 
 
 @dataclass(frozen=True)
@@ -80,9 +81,13 @@ def skill(
     is named in ``failures`` and counts nowhere else.
 
     Raises:
-        ValueError: no frame lies a lead after a start.
+        ValueError: no frame lies a lead after a start, a lead is negative or no number, or the model's scene is of
+            another dimension than the recording.
         NumericalFailure: every start failed.
     """
+    check_grid(recording.grid, model.scene.dimension)
+    if every < 1 or not all(lead >= 0 for lead in leads):
+        raise ValueError(f"leads must not be negative (s), and every at least 1, got {list(leads)} and {every}")
     if transfer is None:
         transfer = Transfer() if recording.weight is None else Transfer(fade=None)
     targets = _targets(recording, leads, every)

@@ -11,6 +11,7 @@ from tqdm import tqdm
 
 import geometry
 from torchsph.simulator.simulator import Simulation, Simulator
+from torchsph.simulator.transfer.checks import check_grid
 
 from .measurement.error_model import ObservationError
 from .measurement.frame_splines import node_weights
@@ -51,8 +52,11 @@ def filter_sph(
         The fetched grid after each frame's update, on the measurement's grid, mask and times.
 
     Raises:
-        ValueError: the measurement does not hold full vectors.
+        ValueError: the measurement does not hold full vectors, or is of another dimension than the model's scene.
     """
+    check_grid(
+        measured.grid if isinstance(measured, geometry.Recording) else measured.recording.grid, model.scene.dimension
+    )
     prepared = PreparedMeasurement.of(measured, progress=progress)
     prepared.type.require_full("method sph imposes")
     measured, error = prepared.recording, prepared.error

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from regularize.native import loader
+from regularize.native.faults import raise_faults
 from regularize.native.loader import FORCED, PREFERENCE, LibraryMissing
 
 from . import build, structures
@@ -34,6 +35,8 @@ __all__ = ["FORCED", "PREFERENCE", "REALS", "Library", "LibraryMissing", "addres
 
 # what is compiled, and how its functions' names end
 REALS = {torch.float32: "f32", torch.float64: "f64"}
+
+_CURE = "use a larger spacing, or fewer members"
 
 _int, _long, _real = ctypes.c_int32, ctypes.c_int64, ctypes.c_double
 
@@ -67,7 +70,7 @@ def library() -> Library:
     """
     found = loader.choose(family())
     # a library that reads the fields of its arguments elsewhere would crash, or worse, go on
-    if exported_layouts(found.handle) != structures.layouts():
+    if exported_layouts(found.handle) != structures.layouts() or not hasattr(found.handle, "sph_fault"):
         raise LibraryMissing(loader.outdated(family(), found.instruction_set))
     return Library(found.instruction_set, _declare(found.handle))
 
@@ -96,6 +99,7 @@ def exported_layouts(handle: ctypes.CDLL) -> list[tuple[str, str, int, int]]:
 
 def _declare(handle: ctypes.CDLL) -> ctypes.CDLL:
     search, none = ctypes.POINTER(SearchArguments), None
+    guarded = {"sph_grid_closest": _CURE}
     for reals in REALS.values():
         for name, arguments, result in (
             ("sort", (search, ctypes.POINTER(Sizes)), ctypes.c_int),
@@ -115,6 +119,8 @@ def _declare(handle: ctypes.CDLL) -> ctypes.CDLL:
         ):
             function = getattr(handle, f"sph_{name}_{reals}")
             function.argtypes, function.restype = arguments, result
+            guarded[f"sph_{name}_{reals}"] = _CURE
     handle.sph_grid_closest.argtypes, handle.sph_grid_closest.restype = [ctypes.POINTER(ClosestArguments)], None
     handle.sph_fma.argtypes, handle.sph_fma.restype = [_int, _long, ctypes.c_float], _real
+    raise_faults(handle, "sph_fault", guarded)
     return handle

@@ -8,10 +8,11 @@ from torch import Tensor
 from torchsph.pairs.interface import Backend
 
 from .domain import Domain
-from .failures import broken_members, freeze_members, without_lost
+from .failures import broken_members, check_volume, freeze_members, without_lost
 from .population import Population
 from .rollback import RollbackStates
 from .spatial_sort import SpatialSort
+from .state.checks import check_arrays, check_members, check_time
 from .state.neighbour_list import PairSearch, rows_carried
 from .state.particles import Particles, frozen, rows_frozen
 from .state.record import Record
@@ -71,6 +72,8 @@ class AdvancingRun:
             self._stepper.prescribed_kinds = self._pressures.kinds
         self._acceleration = torch.zeros_like(particles.position)
         self._began_at = self._imposed_at = self.time
+        holds = scene.valves and domain.walls is not None and scheme.valve is not None
+        self._filled = domain.filling(particles, self.time) if holds else None
         self._spatial = SpatialSort(search)
 
     @property
@@ -83,10 +86,15 @@ class AdvancingRun:
 
         Raises:
             NumericalFailure: no member is left; a member that fails before is frozen and flagged.
-            ValueError: ``until`` lies in the past.
+            ValueError: ``until`` is not finite, lies in the past or where the wall's motion is not known; or somebody
+                has put in particles whose arrays disagree.
         """
+        until = check_time(until, "the time to advance to")
+        check_arrays(self.particles, self.domain.scene.dimension, self.domain.dtype, self.domain.device)
+        check_members(self.particles)
         if until < self.time:
             raise ValueError(f"cannot advance backwards, from {self.time} s to {until} s")
+        self.domain.check_known(until)
         if until == self.time:
             return
         self.particles = without_lost(self.particles, self.record, self.time)
@@ -102,6 +110,8 @@ class AdvancingRun:
         self.record.searches = self._stepper.pair_search.searches
         self.record.overflows = self._backend.overflows
         self.surroundings.account(self.particles, self.record, self.time, self._began_at)
+        if self._filled is not None:
+            check_volume(self.record, self._filled, self.time)
 
     def _longest_step(self, until: float) -> float:
         """Limit of the steps to time ``until`` (s) that the scheme names outright, internal."""

@@ -110,6 +110,15 @@ class Domain:
                 volume *= length / (vertices[:, axis].max() - vertices[:, axis].min())
         return volume
 
+    def check_known(self, time: float) -> None:
+        """Refuse a time (s) at which nobody knows where the wall is.
+
+        Raises:
+            ValueError: it lies off the key frames of a motion without a period.
+        """
+        if self.scene.walls is not None:
+            self.scene.walls.locate(time)
+
     def filling(self, particles: Particles, time: float) -> Tensor:
         """Volume of the particles inside over that of the walls, or of the periodic box, (members,) float64.
 
@@ -149,10 +158,10 @@ class Domain:
         return [*inner, stop] if stop > start else []
 
     def open_regions(self, time: float) -> tuple[int, ...]:
-        """Regions of the valves that are open at ``time`` (s)."""
+        """Regions of the valves that are open, or leak, at ``time`` (s)."""
         if self.scheme.valve is None:
             return ()
-        return tuple(valve.region for valve in self.scene.valves if valve.is_open(time))
+        return tuple(valve.region for valve in self.scene.valves if valve.passes(time))
 
     def prepare_until(self, start: float, stop: float) -> None:
         """Make the wall fields of a stretch of time (s) beforehand, so that the steps find them."""

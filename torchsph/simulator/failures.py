@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 
 import torch
 from torch import Tensor
@@ -36,8 +37,42 @@ def broken_members(particles: Particles, scheme: Scheme, record: Record) -> Tens
     return broken
 
 
-def freeze_members(broken: Tensor, record: Record, time: float) -> None:
-    """Note members ``broken`` (members,) bool as failed for good, at about ``time`` (s).
+# relative departures of the particles' volume from the cavity's: told beyond the first, void beyond the second
+_VOLUME_TOLD, _VOLUME_SPOILT = 0.03, 0.2
+# a start that fills less of its cavity has a free surface, or is no fluid at all
+_FILLED = 0.8
+_BROKEN = "not finite, too fast for any step, or beyond the density that a rollback allows"
+
+
+def check_volume(record: Record, filled: Tensor, time: float) -> None:
+    """Hold the volume of particles against the cavity's; what is off is told, and ends a member where it spoils it.
+
+    Args:
+        record: of the run, in a scene with valves; its ``filling`` is that of ``time``.
+        filled: (members,) the filling at the start.
+        time: s.
+
+    Raises:
+        NumericalFailure: no member is left.
+    """
+    error = torch.where(filled >= _FILLED, (record.filling / filled - 1.0).abs(), torch.zeros_like(filled))
+    error = torch.where(record.failed, torch.zeros_like(error), error.nan_to_num(0.0))
+    told = bool((record.volume_error > _VOLUME_TOLD).any())
+    record.volume_error = torch.maximum(record.volume_error, error)
+    if bool((error > _VOLUME_TOLD).any()) and not told:
+        warnings.warn(
+            f"the particles' volume is {100 * float(error.max()):.0f} % off that of the walls around them at about "
+            f"{time:.3g} s: more went through the valves, or less, than the walls' motion asks for; look at the valve "
+            "times, or use finer particles or another preset",
+            stacklevel=4,
+        )
+    freeze_members(
+        error > _VOLUME_SPOILT, record, time, f"volume more than {100 * _VOLUME_SPOILT:.0f} % off that of the walls"
+    )
+
+
+def freeze_members(broken: Tensor, record: Record, time: float, reason: str = _BROKEN) -> None:
+    """Note members ``broken`` (members,) bool as failed for good, at about ``time`` (s), for a ``reason`` in words.
 
     Raises:
         NumericalFailure: none is left.
@@ -45,10 +80,10 @@ def freeze_members(broken: Tensor, record: Record, time: float) -> None:
     record.failed |= broken
     if bool(record.failed.all()):
         raise NumericalFailure(
-            f"all {record.members} members have failed (not finite, too fast for any step, or beyond the density that "
-            f"a rollback allows) after {record.steps.tolist()} steps at about {time:.6g} s; lower the Courant "
-            "fraction, raise the sound speed, or check the imposed velocity (largest Mach number "
-            f"{float(record.largest_mach.max()):.2f})"
+            f"all {record.members} members have failed ({reason}) after {record.steps.tolist()} steps at about "
+            f"{time:.6g} s, at a largest Mach "
+            f"number of {float(record.largest_mach.max()):.2f}; look at the velocity and the walls around that "
+            "time; in Python, lower the scheme's courant or raise its sound_speed"
         )
 
 

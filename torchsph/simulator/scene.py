@@ -5,10 +5,20 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
 import geometry
+
+# s: beyond every time of a recording
+_FOREVER = 1e12
+# m^3/s: a measured flux is never exact, however it is stated
+_LEAST_SIGMA = 1e-12
+# labels of faces are bytes
+_MOST_REGION = 255
+# openings and closings of a valve in one stretch of time: more are a slip in its period
+_MOST_BEATS = 100_000
 
 
 @dataclass(frozen=True)
@@ -19,10 +29,10 @@ class Fluid:
     viscosity: float = 0.004
 
     def __post_init__(self) -> None:
-        if not self.density > 0:
-            raise ValueError(f"Fluid.density must be positive (kg/m^3), got {self.density}")
-        if not self.viscosity >= 0:
-            raise ValueError(f"Fluid.viscosity must not be negative (Pa s), got {self.viscosity}")
+        if not 0 < self.density < math.inf:
+            raise ValueError(f"Fluid.density must be positive and finite (kg/m^3), got {self.density}")
+        if not 0 <= self.viscosity < math.inf:
+            raise ValueError(f"Fluid.viscosity must be finite and not negative (Pa s), got {self.viscosity}")
 
     @property
     def kinematic_viscosity(self) -> float:
@@ -46,6 +56,10 @@ class Valve:
             is linear between its times and repeats with ``period``. The other open valves take what it leaves of the
             change of the cavity's volume. None: this one does, beside others by what each carries when a field is
             imposed.
+        flux_sigma: m^3/s, standard deviation of ``flux``. Where no open valve is left to take the rest, uncertain
+            fluxes are moved, each by its variance, until they sum to the change of the cavity's volume. 0: exact.
+        leak: part of the opening's area that stays open while the valve is shut, from 0 to below 1: a soft closed
+            valve. It passes what an imposed field has there, or shares by that area. None: shut is shut.
         stagnation: whether ``pressure`` is that of still fluid behind the valve, of which fluid that enters has spent
             rho v^2 / 2 (Bernoulli), or the static pressure in the opening itself. Fluid leaves against either alike.
     """
@@ -57,10 +71,14 @@ class Valve:
     pressure: float | Callable[[float], float] | None = None
     stagnation: bool = True
     flux: float | Callable[[float], float] | tuple[Sequence[float], Sequence[float]] | None = None
+    flux_sigma: float = 0.0
+    leak: float | None = None
 
     def __post_init__(self) -> None:
-        if self.region < 1:
-            raise ValueError(f"Valve.region must be at least 1 (0 labels the wall), got {self.region}")
+        if self.region != int(self.region) or not 1 <= self.region <= _MOST_REGION:
+            raise ValueError(
+                f"Valve.region must be a whole number from 1 (0 labels the wall) to {_MOST_REGION}, got {self.region}"
+            )
         for opening, closing in self.intervals:
             if not closing > opening:
                 raise ValueError(f"valve of region {self.region}: closes at {closing} s before it opens at {opening} s")
@@ -75,6 +93,11 @@ class Valve:
             raise ValueError(f"valve of region {self.region}: give its flux or its pressure, not both")
         if isinstance(self.flux, tuple):
             self._check_table(self.flux)
+        if not 0 <= self.flux_sigma < math.inf:
+            given = f"got {self.flux_sigma}"
+            raise ValueError(f"Valve.flux_sigma of region {self.region} must be finite, not negative (m^3/s), {given}")
+        if self.leak is not None and not 0 <= self.leak < 1:
+            raise ValueError(f"Valve.leak of region {self.region} must lie in [0, 1) or be None, got {self.leak}")
 
     def _check_table(self, table: tuple[Sequence[float], Sequence[float]]) -> None:
         """Raise ValueError where a table of fluxes has no times that increase, or a flux that is not finite."""
@@ -133,11 +156,24 @@ class Valve:
             times = [time] + [t for t in (time - self.period, time + self.period) if not first <= t <= last]
         return any(opening <= t < closing for opening, closing in self.intervals for t in times)
 
+    def passes(self, time: float) -> bool:
+        """Whether anything may go through at ``time`` (s): the valve is open, or leaks."""
+        return bool(self.leak) or self.is_open(time)
+
+    def open_part(self, time: float) -> float:
+        """Part of the opening's area that is open at ``time`` (s)."""
+        return 1.0 if self.is_open(time) else self.leak or 0.0
+
     def events(self, start: float, stop: float) -> list[float]:
         """Times in [start, stop], s, at which the valve may open or close."""
         times = [t for interval in self.intervals for t in interval]
         if not self.period or not times:
             return [t for t in times if start <= t <= stop]
+        if (stop - start) / self.period > _MOST_BEATS:
+            raise ValueError(
+                f"valve of region {self.region}: its period of {self.period:g} s fits more than {_MOST_BEATS} times "
+                f"into {start:g} to {stop:g} s; give all of them in seconds"
+            )
         found: set[float] = set()
         for t in (*times, *self._covered):
             beats = range(math.ceil((start - t) / self.period), math.floor((stop - t) / self.period) + 1)
@@ -179,13 +215,14 @@ class Scene:
     dimension: int = 3
 
     def __post_init__(self) -> None:
-        if not self.spacing > 0:
-            raise ValueError(f"Scene.spacing must be positive (m), got {self.spacing}")
+        if not 0 < self.spacing < math.inf:
+            raise ValueError(f"Scene.spacing must be positive and finite (m), got {self.spacing}")
         if self.dimension not in (2, 3):
             raise ValueError(f"Scene.dimension must be 2 or 3, got {self.dimension}")
-        if not self.reference_speed > 0:
-            raise ValueError(f"Scene.reference_speed must be positive (m/s), got {self.reference_speed}")
-        if self.valves and all(valve.flux is not None for valve in self.valves):
+        if not 0 < self.reference_speed < math.inf:
+            raise ValueError(f"Scene.reference_speed must be positive and finite (m/s), got {self.reference_speed}")
+        exact = [valve.flux is not None and not valve.flux_sigma for valve in self.valves]
+        if self.valves and all(exact):
             raise ValueError(
                 "every valve has a given flux: leave the flux of at least one to what is left of dV/dt (flux=None)"
             )
@@ -195,6 +232,27 @@ class Scene:
             value = getattr(self, name)
             if value is not None and not callable(value) and len(value) != self.dimension:
                 raise ValueError(f"Scene.{name} needs {self.dimension} entries, got {len(value)}")
+        if self.gravity is not None and not callable(self.gravity) and not all(map(math.isfinite, self.gravity)):
+            raise ValueError(f"Scene.gravity must be finite (m/s^2), got {self.gravity}")
+        if not all(length is None or 0 < length < math.inf for length in self.period or ()):
+            raise ValueError(f"Scene.period must be positive and finite (m), or None along an axis, got {self.period}")
+        self._check_walls()
+
+    def _check_walls(self) -> None:
+        """Raise ValueError where walls have another dimension, or a valve no faces of them, or faces of another's."""
+        if self.walls is None:
+            return
+        if self.walls.dimension != self.dimension:
+            raise ValueError(f"Scene.dimension is {self.dimension}, but its walls have {self.walls.dimension}")
+        regions, present = [valve.region for valve in self.valves], set(np.unique(self.walls.region).tolist())
+        missing = sorted(set(regions) - present)
+        if missing:
+            raise ValueError(
+                f"the valve of region {missing[0]} has no face in the walls, whose regions are {sorted(present)}; "
+                "label the faces of its orifice, or leave the valve out"
+            )
+        if len(set(regions)) < len(regions):
+            raise ValueError(f"two valves have the same region: {sorted(regions)}; give one of them all intervals")
 
     def gravity_at(self, time: float) -> tuple[float, ...]:
         """The body force per mass (D,), m/s^2, at ``time`` (s).
@@ -224,6 +282,8 @@ class Scene:
         ``spacing`` defaults to the smallest grid spacing. The reference speed is 1 m/s, typical of the heart, so that
         the same scene results from a noisy and from a clean recording. Walls that flicker are estimated, and valve
         times that the recording lacks or cannot mean (``geometry.estimated``), unless ``estimates`` holds them already.
+        A flux that the recording has measured is that of its valve, with its error; ``/valve/leak`` is the valve's
+        leak.
         """
         recording.wall_for("the simulator")
         recording = (geometry.estimated(recording) if estimates is None else estimates).recording
@@ -237,8 +297,19 @@ class Scene:
                 closing = float(closing) if math.isfinite(closing) else span[1]
             rows.append((float(opening), float(closing)))
         present = {int(region) for region in recording.wall_for("the simulator").region}
+        rows_of_leak = [] if recording.valve_leak is None else recording.valve_leak.tolist()
+        leak = {int(region): part for region, part in rows_of_leak if part > 0}
+        measured = {flux.region: flux for flux in recording.fluxes}
         valves = tuple(
-            Valve(r, tuple(sorted(rows)), recording.period, span) for r, rows in sorted(regions.items()) if r in present
+            Valve(
+                region,
+                tuple(sorted(regions.get(region, []))),
+                recording.period,
+                span,
+                leak=leak.get(region),
+                **_given_flux(measured.get(region), recording),
+            )
+            for region in sorted((set(regions) | set(leak)) & present)
         )
         return cls(
             spacing=float(min(recording.grid.spacing)) if spacing is None else spacing,
@@ -247,3 +318,13 @@ class Scene:
             valves=valves,
             dimension=recording.dimension,
         )
+
+
+def _given_flux(flux: geometry.OpeningFlux | None, recording: geometry.Recording) -> dict[str, Any]:
+    """A measured flux as a valve's: beyond the frames of a recording that does not repeat it stays what it was last."""
+    if flux is None:
+        return {}
+    times, values = [float(t) for t in recording.time], [float(value) for value in flux.value]
+    if not recording.period:
+        times, values = [-_FOREVER, *times, _FOREVER], [values[0], *values, values[-1]]
+    return {"flux": (times, values), "flux_sigma": max(float(np.sqrt(np.mean(flux.deviation**2))), _LEAST_SIGMA)}

@@ -18,6 +18,7 @@ from .schemes.scheme import Scheme
 from .state.particles import Particles
 from .stepping.coefficients import Coefficients
 from .stepping.pressure import Neighbourhood, divergence_free
+from .transfer.checks import check_grid, check_mask, check_velocity, check_weight
 from .transfer.fetching import fetch_on_grid
 from .transfer.imposing import pulled
 
@@ -89,10 +90,17 @@ class Simulation(AdvancingRun):
                 weighs them in XSPH and in fetching (Grønli 2017, sec. 5.2). None: all alike.
 
         Raises:
-            ValueError: a confidence is negative or not finite.
+            TypeError: something else than tensors, or a mask that is not bool.
+            ValueError: another dimension or shape than the run's and the grid's, no node in the mask, a velocity that
+                is not finite there, a confidence that is negative or not finite.
         """
-        if confidence is not None and not bool((torch.isfinite(confidence) & (confidence >= 0)).all()):
-            raise ValueError("confidences must be finite and not negative")
+        check_grid(grid, self.domain.scene.dimension)
+        check_mask(mask, grid)
+        check_velocity("velocity", velocity, grid, mask, (1, self.members))
+        if not bool(mask.any()):
+            raise ValueError("mask holds no node: no velocity is known anywhere, so there is nothing to impose")
+        if confidence is not None:
+            check_weight("confidence", confidence, grid)
         self.particles = self.surroundings.imposed(self.particles, grid, velocity, mask, self.time)
         carried = None
         if confidence is not None:
@@ -133,13 +141,32 @@ class Simulation(AdvancingRun):
         """Pull the particles' velocities towards a measured grid.
 
         Args:
-            target: (D, *shape), m/s. gain: (*shape) in [0, 1]. weight: (*shape) confidence, 0 where nothing is known.
+            grid: the nodes, m.
+            target: (D, *shape), m/s.
+            gain: (*shape), in [0, 1].
+            weight: (*shape), not negative, confidence; 0 where nothing is known and the target may be anything.
+
+        Raises:
+            TypeError: something else than tensors of floating-point numbers.
+            ValueError: another dimension or shape than the run's and the grid's, or a value that cannot be.
         """
+        check_grid(grid, self.domain.scene.dimension)
+        check_weight("weight", weight, grid)
+        check_weight("gain", gain, grid, most=1.0)
+        check_velocity("target", target, grid, weight > 0)
         p = self.particles
+        target, gain, weight = (each.to(p.velocity) for each in (target, gain, weight))
         points = p.position * self.units.length
         moved = pulled(points, p.velocity * self.units.speed, grid, target, gain, weight) / self.units.speed
         self.particles = p.changed(velocity=torch.where(p.inside[:, None], moved, p.velocity))
 
     def fetch(self, grid: Grid, mask: Tensor) -> Fetched:
-        """Velocities at the nodes where ``mask`` (*shape): value (members, D, *shape), covered (members, *shape)."""
+        """Velocities at the nodes where ``mask`` (*shape): value (members, D, *shape), covered (members, *shape).
+
+        Raises:
+            TypeError: a mask that is not bool.
+            ValueError: another dimension or shape than the run's and the grid's.
+        """
+        check_grid(grid, self.domain.scene.dimension)
+        check_mask(mask, grid)
         return fetch_on_grid(self.particles, grid, mask, self.units, self._backend, self.domain.period)

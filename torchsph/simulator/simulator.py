@@ -14,6 +14,7 @@ from .schemes.presets import preset
 from .schemes.scheme import Scheme
 from .seeding import Seeding, seed_particles
 from .simulation import Simulation
+from .state.checks import check_arrays, check_seed, check_time, check_values, usable_device
 from .state.particles import Particles
 from .state.units import Units
 
@@ -44,6 +45,7 @@ class Simulator:
         object.__setattr__(self, "scheme", scheme)
         if self.dtype not in (torch.float32, torch.float64):
             raise ValueError(f"Simulator.dtype must be torch.float32 or torch.float64, got {self.dtype}")
+        object.__setattr__(self, "device", usable_device(self.device))
         choose_backend(self.backend, self.device)  # a missing backend must not surface in the middle of a run
         units = Units(self.scene.spacing, self.scene.reference_speed)
         domain = Domain(self.scene, scheme, units, self.device, self.dtype)
@@ -55,16 +57,29 @@ class Simulator:
         return self._domain
 
     def start(self, time: float, *, members: int = 1, seed: int = 0) -> Simulation:
-        """A resting fluid at ``time`` (s): ``members`` copies of one seeding, drawn with ``seed``."""
-        if members < 1:
-            raise ValueError(f"a simulation needs at least one member, got {members}")
-        generator = torch.Generator(device=self.device).manual_seed(seed)
+        """A resting fluid at ``time`` (s): ``members`` copies of one seeding, drawn with ``seed``.
+
+        Raises:
+            ValueError: no member, a time that is not finite or at which the wall is not known.
+        """
+        time = check_time(time, "time")
+        if int(members) != members or members < 1:
+            raise ValueError(f"a simulation needs at least one member, a whole number of them, got {members}")
+        generator = torch.Generator(device=self.device).manual_seed(check_seed(seed))
         backend = choose_backend(self.backend, self.device)
         single = seed_particles(self.domain, backend, time, generator, self.seeding)
         return self.resume(single.repeated(members), time)
 
     def resume(self, particles: Particles, time: float) -> Simulation:
-        """Run on with particles in internal units that were made elsewhere."""
+        """Run on with particles in internal units that were made elsewhere.
+
+        Raises:
+            TypeError: arrays that are no tensors, or of another type than the simulator's.
+            ValueError: arrays that disagree in length, dimension or device; values that no run can step.
+        """
+        time = check_time(time, "time")
+        check_arrays(particles, self.scene.dimension, self.dtype, self.device)
+        check_values(particles, self.domain.valves.buffers)
         run = Simulation(self.domain, choose_backend(self.backend, self.device), particles, time)
         run.simulator = self
         return run

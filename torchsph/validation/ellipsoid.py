@@ -1,4 +1,4 @@
-"""A pulsating ellipsoid with one open end: affine wall motion, and the potential flow it drives, for tests."""
+"""A pulsating ellipsoid with one open end, or two: affine wall motion, and the potential flow it drives, for tests."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from torchsph.simulator.schemes.wall_models import CompleteKernelWall
 from torchsph.simulator.simulation import Simulation
 from torchsph.simulator.simulator import Simulator
 
-OPENING = 1
+OPENING, LEAK = 1, 2
 # so far (spacings) from walls and opening the core begins
 _RIND = 2.0
 
@@ -27,7 +27,8 @@ class PulsatingEllipsoid:
     """A spheroid around z, cut by a plane across its upper end, whose points move as (r x, r y, s z)(t) from t = 0.
 
     r = (1 - p)^k and s = (1 - p)^(1 - 2 k) with p = stroke (1 - cos(2 pi t / period)) / 2, so that the volume is
-    (1 - p) of the first one in closed form. The plane is the opening (region 1); it is open all the time.
+    (1 - p) of the first one in closed form. The plane is the opening (region 1); it is open all the time. With a leak
+    the lower end is cut as well (region 2) and passes a fixed part of dV/dt.
 
     Attributes:
         radius: semi-axis across z at t = 0, m.
@@ -36,6 +37,8 @@ class PulsatingEllipsoid:
         stroke: part of the volume that is ejected.
         period: s.
         share: k, what the width takes of the volume's change.
+        leak: part of dV/dt that goes through the lower end, or 0: it is not cut.
+        leak_opening: polar angle of the lower end's rim, degrees, from below.
     """
 
     radius: float = 8e-3
@@ -44,6 +47,13 @@ class PulsatingEllipsoid:
     stroke: float = 0.4
     period: float = 0.2
     share: float = 0.4
+    leak: float = 0.0
+    leak_opening: float = 35.0
+
+    @property
+    def lower_plane(self) -> float:
+        """Depth of the lower end below the centre in semi-axes."""
+        return float(np.cos(np.radians(self.leak_opening))) if self.leak else 1.0
 
     @property
     def plane(self) -> float:
@@ -57,7 +67,7 @@ class PulsatingEllipsoid:
 
     def volume(self, time: float) -> float:
         """V, m^3."""
-        part = 2 / 3 + self.plane - self.plane**3 / 3
+        part = self.lower_plane - self.lower_plane**3 / 3 + self.plane - self.plane**3 / 3
         return self.fraction(time)[0] * np.pi * self.radius**2 * self.height * part
 
     def volume_rate(self, time: float) -> float:
@@ -77,14 +87,17 @@ class PulsatingEllipsoid:
 
     def motion(self, spacing: float, beats: int = 1, keys: int = 24) -> geometry.WallMotion:
         """The wall with vertices about ``spacing`` (m) apart, at ``keys`` key frames a beat, periodic."""
-        steps = max(8, round((np.pi - np.radians(self.opening)) * max(self.radius, self.height) / spacing))
-        angle = np.linspace(np.pi, np.radians(self.opening), steps + 1)
+        lowest = np.pi - np.radians(self.leak_opening) if self.leak else np.pi
+        steps = max(8, round((lowest - np.radians(self.opening)) * max(self.radius, self.height) / spacing))
+        angle = np.linspace(lowest, np.radians(self.opening), steps + 1)
         across = max(2, round(self.radius * np.sin(angle[-1]) / spacing))
-        ring = np.concatenate([np.sin(angle), np.sin(angle[-1]) * (1 - np.arange(1, across + 1) / across)])
+        below = max(2, round(self.radius * np.sin(lowest) / spacing)) if self.leak else 0
+        disc = np.sin(angle[-1]) * (1 - np.arange(1, across + 1) / across)
+        ring = np.concatenate([np.sin(lowest) * np.arange(below) / max(below, 1), np.sin(angle), disc])
         ring[[0, -1]] = 0.0
-        level = np.concatenate([np.cos(angle), np.full(across, self.plane)])
+        level = np.concatenate([np.full(below, -self.lower_plane), np.cos(angle), np.full(across, self.plane)])
         profile = np.stack([self.radius * ring, self.height * level], 1)
-        surface = geometry.revolved(profile, spacing, np.repeat([0, OPENING], [steps, across]))
+        surface = geometry.revolved(profile, spacing, np.repeat([LEAK, 0, OPENING], [below, steps, across]))
         times = np.linspace(0, beats * self.period, beats * keys + 1)
         stretch = np.array([[*([self.scales(t)[0]] * 2), self.scales(t)[1]] for t in times])
         places = surface.vertices * stretch[:, None]
@@ -96,9 +109,8 @@ class PulsatingEllipsoid:
     def start(self, scheme: str | Scheme, across: int = 16, backend: str = "auto") -> Simulation:
         """Blood at rest at t = 0 in free-slip walls, ``across`` spacings wide; ``scheme`` or a preset of that name."""
         spacing = 2 * self.radius / across
-        scene = Scene(
-            spacing=spacing, fluid=Fluid(), walls=self.motion(spacing / 2), valves=(Valve(OPENING, ((-1.0, 1e9),)),)
-        )
+        valves = tuple(Valve(region, ((-1.0, 1e9),)) for region in ((OPENING, LEAK) if self.leak else (OPENING,)))
+        scene = Scene(spacing=spacing, fluid=Fluid(), walls=self.motion(spacing / 2), valves=valves)
         scheme = preset(scheme) if isinstance(scheme, str) else scheme
         return Simulator(scene, replace(scheme, wall=CompleteKernelWall(no_slip=False)), backend=backend).start(0.0)
 
@@ -129,7 +141,14 @@ class PulsatingEllipsoid:
         """The potential flow at ``time`` (s): the wall's normal velocity, a plug through the opening."""
         across, along = self.scales(time)
         return PotentialFlow(
-            self.radius * across, self.height * along, self.plane, self.strain(time), self.volume_rate(time), order
+            self.radius * across,
+            self.height * along,
+            self.plane,
+            self.strain(time),
+            self.volume_rate(time),
+            order,
+            self.lower_plane,
+            self.leak,
         )
 
 
@@ -147,6 +166,8 @@ class PotentialFlow:
         strain: (3,), 1/s.
         rate: dV/dt, m^3/s.
         order: highest n.
+        lower_plane: depth of a cut across the lower end in semi-axes, 1 without.
+        leak: part of ``rate`` that enters through it.
     """
 
     radius: float
@@ -155,6 +176,8 @@ class PotentialFlow:
     strain: np.ndarray
     rate: float
     order: int
+    lower_plane: float = 1.0
+    leak: float = 0.0
 
     @cached_property
     def _scale(self) -> float:
@@ -164,28 +187,35 @@ class PotentialFlow:
     def plug(self) -> float:
         """Velocity along z in the opening, m/s: what leaves the volume and the plane's own motion."""
         area = np.pi * self.radius**2 * (1 - self.plane**2)
-        return float(self.strain[2] * self.plane * self.height - self.rate / area)
+        return float(self.strain[2] * self.plane * self.height - (1 - self.leak) * self.rate / area)
+
+    @property
+    def lower_plug(self) -> float:
+        """Velocity along z in the lower end, m/s."""
+        area = np.pi * self.radius**2 * (1 - self.lower_plane**2)
+        entering = self.leak * self.rate / area if self.leak else 0.0
+        return float(-self.strain[2] * self.lower_plane * self.height + entering)
 
     def _boundary(self, count: int = 400) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Points (m, 2) of (r, z), outward normals (m, 2), normal velocities (m,) and area weights (m,)."""
         node, weight = np.polynomial.legendre.leggauss(count)
-        first = np.arccos(self.plane)
-        angle = first + (np.pi - first) * (node + 1) / 2
+        first, last = np.arccos(self.plane), np.pi - np.arccos(self.lower_plane)
+        angle = first + (last - first) * (node + 1) / 2
         wall = np.stack([self.radius * np.sin(angle), self.height * np.cos(angle)], 1)
         normal = np.stack([np.sin(angle) / self.radius, np.cos(angle) / self.height], 1)
         stretch = np.hypot(self.radius * np.cos(angle), self.height * np.sin(angle))
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-        wide = self.radius * np.sin(first) * (node + 1) / 2
-        disc = np.stack([wide, np.full(count, self.plane * self.height)], 1)
-        up = np.tile([0.0, 1.0], (count, 1))
-        speed = (wall * self.strain[[0, 2]] * normal).sum(1)
-        area = [weight * stretch * wall[:, 0] * (np.pi - first) / 2, weight * wide * self.radius * np.sin(first) / 2]
-        return (
-            np.concatenate([wall, disc]),
-            np.concatenate([normal, up]),
-            np.concatenate([speed, np.full(count, self.plug)]),
-            np.concatenate(area),
-        )
+        points, normals, speeds = [wall], [normal], [(wall * self.strain[[0, 2]] * normal).sum(1)]
+        areas = [weight * stretch * wall[:, 0] * (last - first) / 2]
+        discs = [(self.plane, 1.0, self.plug), (-self.lower_plane, -1.0, -self.lower_plug)]
+        for level, outwards, speed in discs if self.leak else discs[:1]:
+            widest = self.radius * np.sqrt(1 - level**2)
+            wide = widest * (node + 1) / 2
+            points.append(np.stack([wide, np.full(count, level * self.height)], 1))
+            normals.append(np.tile([0.0, outwards], (count, 1)))
+            speeds.append(np.full(count, speed))
+            areas.append(weight * wide * widest / 2)
+        return np.concatenate(points), np.concatenate(normals), np.concatenate(speeds), np.concatenate(areas)
 
     @cached_property
     def _fit(self) -> tuple[np.ndarray, float]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 from pathlib import Path
 
 from geometry.formats.labelled_arrays import to_xarray
@@ -10,5 +11,8 @@ from geometry.recordings.recording import Recording
 
 def write_netcdf(path: Path, recording: Recording) -> list[Path]:
     """The dataset of `to_xarray`."""
-    to_xarray(recording).to_netcdf(path)
+    try:
+        to_xarray(recording).to_netcdf(path)
+    except RuntimeError as fault:  # what the library makes of a disk that is full
+        raise OSError(errno.EIO, f"the file could not be written ({fault})", str(path)) from fault
     return [path]

@@ -6,7 +6,8 @@ as the first axis, polygonal data with the parts of all times in a row.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
 
@@ -14,6 +15,7 @@ import h5py
 import numpy as np
 
 from geometry.recordings.recording import Recording
+from geometry.recordings.whole_file import write_whole
 
 from .common import SCALARS, VECTORS, lattice, scalar, vector, wall_velocity
 
@@ -22,7 +24,7 @@ TOPOLOGIES = ("Vertices", "Lines", "Polygons", "Strips")
 
 def write_vtkhdf(path: Path, recording: Recording) -> list[Path]:
     """The fields of the grid to `path`, the wall beside it as `NAME_wall.vtkhdf`."""
-    with h5py.File(path, "w") as file:
+    with _in_memory(path) as file:
         points = _image(file, recording)
         for name in VECTORS:
             field = vector(recording, name)
@@ -50,7 +52,7 @@ def write_sidecar(recording_file: str | Path) -> list[Path]:
     source = Path(recording_file)
     recording = read_recording(source)
     path = source.with_suffix(".vtkhdf")
-    with h5py.File(path, "w") as file, h5py.File(source, "r") as original:
+    with _in_memory(path) as file, h5py.File(source, "r") as original:
         points = _image(file, recording)
         for name in (*VECTORS, *SCALARS):
             node = original.get(f"/{name}")
@@ -60,12 +62,22 @@ def write_sidecar(recording_file: str | Path) -> list[Path]:
     return [path, *_wall(path, recording)]
 
 
+@contextmanager
+def _in_memory(path: Path) -> Iterator[h5py.File]:
+    """A file that is made in memory and written whole: HDF5 does not survive a disk that is full."""
+    with h5py.File(f"{path} in memory", "w", driver="core", backing_store=False) as file:
+        yield file
+        file.flush()
+        image = file.id.get_file_image()
+    write_whole(path, image)
+
+
 class PolySeries:
-    """A temporal file of polygonal data (walls, particles) that grows by one time after the other."""
+    """A temporal file of polygonal data (walls, particles) that grows by one time after the other, in memory."""
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
-        self._file = h5py.File(self.path, "w")
+        self._file = h5py.File(f"{self.path} in memory", "w", driver="core", backing_store=False)
         root = self._file.create_group("VTKHDF")
         root.attrs["Version"] = np.array([2, 0], np.int64)
         root.attrs.create("Type", np.bytes_("PolyData"))
@@ -78,12 +90,18 @@ class PolySeries:
         return self
 
     def __exit__(self, kind: type | None, fault: BaseException | None, trace: TracebackType | None) -> None:
-        self.close()
+        if fault is None:
+            self.close()
+        else:
+            self._file.close()
 
     def close(self) -> None:
-        """Finish the file."""
+        """Write the file, which nobody sees before."""
         self._steps.attrs["NSteps"] = np.int64(self._count)
+        self._file.flush()
+        image = self._file.id.get_file_image()
         self._file.close()
+        write_whole(self.path, image)
 
     def append(
         self,

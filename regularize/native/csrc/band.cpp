@@ -9,6 +9,8 @@
 #include <cstdint>
 #include <vector>
 
+#include "guard.hpp"
+
 #ifdef _OPENMP
 #include <omp.h>
 #endif
@@ -292,22 +294,22 @@ extern "C" {
 
 // Overwrite a band (count, width) by its factor; reach[j], rising: last row of column j. 0: not positive definite.
 int32_t spline_factor_f64(double* band, int64_t count, int64_t width, const int64_t* reach) {
-  return factorise(Band<double>{band, count, width, reach});
+  return guard::call([&] { return factorise(Band<double>{band, count, width, reach}); });
 }
 
 int32_t spline_factor_f32(float* band, int64_t count, int64_t width, const int64_t* reach) {
-  return factorise(Band<float>{band, count, width, reach});
+  return guard::call([&] { return factorise(Band<float>{band, count, width, reach}); });
 }
 
 // x (sides, count) in place; parts 1: L x = right, 2: L' x = right, 3: both
 void spline_solve_f64(double* band, int64_t count, int64_t width, const int64_t* reach, int32_t parts, int64_t sides,
                       double* x) {
-  solve(Band<double>{band, count, width, reach}, parts, sides, x);
+  guard::call([&] { solve(Band<double>{band, count, width, reach}, parts, sides, x); });
 }
 
 void spline_solve_f32(float* band, int64_t count, int64_t width, const int64_t* reach, int32_t parts, int64_t sides,
                       float* x) {
-  solve(Band<float>{band, count, width, reach}, parts, sides, x);
+  guard::call([&] { solve(Band<float>{band, count, width, reach}, parts, sides, x); });
 }
 
 }  // extern "C"

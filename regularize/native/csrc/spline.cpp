@@ -7,9 +7,12 @@
 #include <algorithm>
 #include <cstdint>
 #include <cstring>
+#include <optional>
 #include <vector>
 
+#include "guard.hpp"
 #include "processor.hpp"
+#include "spline.hpp"
 
 #ifdef _OPENMP
 #include <omp.h>
@@ -31,40 +34,11 @@ constexpr int kCols = 2 * kWidth;     // tile columns: two vectors
 constexpr int kWorthThreads = 4096;   // rows: with fewer the threads' meetings cost more
 constexpr int kDepth = 32;            // points whose stencils are buffered before they are summed
 constexpr int kAhead = 16;             // rows whose targets are fetched before they are needed
-constexpr int kMaxComponents = 3;
-constexpr int kMaxAxes = 4;
-constexpr int kMaxOrder = 6;  // degree + 1
 
 // Inlined into a caller that knows the sizes at compile time, these small loops become straight vector code.
 #define SPLINE_INLINE inline __attribute__((always_inline))
 
 enum Kind : int32_t { kVector = 0, kDirection = 1, kDivergence = 2, kCellScalar = 3, kCellCoupled = 4 };
-
-}  // namespace
-
-extern "C" {
-
-struct SplineGrid {
-  int32_t axes, components, degree, padded;  // padded: local coefficients rounded up to the tile width
-  int32_t axis_of_component[kMaxAxes];       // place of component k's own axis among the solve axes
-  double spacing[kMaxAxes];                  // knot distance along the solve axes, m
-  double pieces[kMaxOrder * kMaxOrder];      // (degree + 1, degree + 1): row k holds the factors of t^k of each function
-  int64_t cells, nodes;                      // cells that hold rows, active coefficients
-  const int32_t* position;                   // (cells, local) solve positions, rising within a cell
-};
-
-struct SplineRows {
-  int32_t kind, shared;      // shared: all components have the same weight (kVector)
-  int64_t count;             // rows' points; 0 for the cell kinds
-  const int64_t* start;      // (cells + 1) points of each cell; for the cell kinds 0 or 1 blocks
-  const double* t;           // (count, axes) local coordinates, slowest solve axis first
-  const double* coefficient; // (count, components): weight, weight * direction, or weight in column 0
-  const double* gram;        // (local, local), or (C, C, local, local) for kCellCoupled
-};
-
-}  // extern "C"
-
-namespace {
 
 constexpr int power(int base, int exponent) { return exponent == 0 ? 1 : base * power(base, exponent - 1); }
 
@@ -301,6 +275,80 @@ PullCell pull_cell_for(const SplineGrid& g) {
   return pull_cell<Sizes<0, 0, 0>>;
 }
 
+// Sum all blocks' rows into the lower band (nodes * components, width). Cells come in slabs (slab_start, slabs
+// + 1) along the slowest axis; slabs two apart share no coefficient, so even and odd ones take turns.
+void gram(const SplineGrid* grid, const SplineRows* blocks, int32_t block_count, const int64_t* slab_start,
+          int64_t slabs, double* band, int64_t width) {
+  const SplineGrid& g = *grid;
+  const int local = local_size(g);
+  guard::Rescue rescue;
+  for (int parity = 0; parity < 2; ++parity) {
+#pragma omp parallel if (g.cells > kWorthThreads / 16)
+    {
+      std::optional<CellGram> room;
+      const bool ready = rescue.run([&] { room.emplace(g.components, g.padded); });
+#pragma omp for schedule(dynamic, 1)
+      for (int64_t slab = parity; slab < slabs; slab += 2) {
+        for (int64_t number = slab_start[slab]; ready && number < slab_start[slab + 1]; ++number) {
+          CellGram& cell = *room;
+          cell.clear();
+          for (int32_t b = 0; b < block_count; ++b) {
+            const SplineRows& rows = blocks[b];
+            if (rows.kind >= kCellScalar) {
+              if (rows.start[number + 1] > rows.start[number]) add_constant(g, rows, local, cell);
+            } else {
+              add_point_rows(g, rows, rows.start[number], rows.start[number + 1], cell);
+            }
+          }
+          scatter(g, number, local, cell, band, width);
+        }
+      }
+    }
+  }
+  rescue.rethrow();
+}
+
+// out (nodes, C) += rows' (target - rows x), the rows of one block. target in the caller's order, of which number[n] is
+// row n's place; null: zero. x (nodes, C); null: zero. Slabs as in gram: they take turns, so that every
+// coefficient's sum has one order, whatever the number of threads and whichever comes first.
+void gradient(const SplineGrid* grid, const SplineRows* rows, const int64_t* slab_start, int64_t slabs,
+              const double* target, const int64_t* number, const double* x, double* out) {
+  const SplineGrid& g = *grid;
+  const int local = local_size(g);
+  const size_t size = size_t(local) * g.components;
+  const PullCell pull = pull_cell_for(g);
+  guard::Rescue rescue;
+  for (int parity = 0; parity < 2; ++parity) {
+#pragma omp parallel if (rows->count > kWorthThreads)
+    {
+      std::vector<double> row, near, pulled;
+      const bool ready = rescue.run([&] { row.resize(size), near.resize(size), pulled.resize(size); });
+#pragma omp for schedule(dynamic, 1)
+      for (int64_t slab = parity; slab < slabs; slab += 2) {
+        for (int64_t cell = slab_start[slab]; ready && cell < slab_start[slab + 1]; ++cell) {
+          if (rows->start[cell] == rows->start[cell + 1]) continue;
+          const int32_t* position = g.position + cell * local;
+          if (x) gather(g, position, local, x, near.data());
+          std::fill(pulled.begin(), pulled.end(), 0.0);
+          pull(g, *rows, cell, target, number, x ? near.data() : nullptr, row.data(), pulled.data());
+          scatter_add(g, position, local, pulled.data(), out);
+        }
+      }
+    }
+  }
+  rescue.rethrow();
+}
+
+// Counting sort: number[place] is the row at each place when rows are sorted by their slot, equal ones in their order;
+// start (slots + 1) the first place of each slot.
+void sort(const int64_t* slot, int64_t count, int64_t slots, int64_t* number, int64_t* start) {
+  std::fill_n(start, slots + 1, 0);
+  for (int64_t n = 0; n < count; ++n) ++start[slot[n] + 1];
+  for (int64_t s = 0; s < slots; ++s) start[s + 1] += start[s];
+  std::vector<int64_t> next(start, start + slots);
+  for (int64_t n = 0; n < count; ++n) number[next[slot[n]]++] = n;
+}
+
 }  // namespace
 
 extern "C" {
@@ -317,71 +365,20 @@ void spline_set_threads(int32_t threads) {
 #endif
 }
 
-// Sum all blocks' rows into the lower band (nodes * components, width). Cells come in slabs (slab_start, slabs
-// + 1) along the slowest axis; slabs two apart share no coefficient, so even and odd ones take turns.
+int32_t spline_fault(char* text, int64_t room) { return guard::read(text, room); }
+
 void spline_gram(const SplineGrid* grid, const SplineRows* blocks, int32_t block_count, const int64_t* slab_start,
                  int64_t slabs, double* band, int64_t width) {
-  const SplineGrid& g = *grid;
-  const int local = local_size(g);
-  for (int parity = 0; parity < 2; ++parity) {
-#pragma omp parallel if (g.cells > kWorthThreads / 16)
-    {
-      CellGram cell(g.components, g.padded);
-#pragma omp for schedule(dynamic, 1)
-      for (int64_t slab = parity; slab < slabs; slab += 2) {
-        for (int64_t number = slab_start[slab]; number < slab_start[slab + 1]; ++number) {
-          cell.clear();
-          for (int32_t b = 0; b < block_count; ++b) {
-            const SplineRows& rows = blocks[b];
-            if (rows.kind >= kCellScalar) {
-              if (rows.start[number + 1] > rows.start[number]) add_constant(g, rows, local, cell);
-            } else {
-              add_point_rows(g, rows, rows.start[number], rows.start[number + 1], cell);
-            }
-          }
-          scatter(g, number, local, cell, band, width);
-        }
-      }
-    }
-  }
+  guard::call([&] { gram(grid, blocks, block_count, slab_start, slabs, band, width); });
 }
 
-// out (nodes, C) += rows' (target - rows x), the rows of one block. target in the caller's order, of which number[n] is
-// row n's place; null: zero. x (nodes, C); null: zero. Slabs as in spline_gram: they take turns, so that every
-// coefficient's sum has one order, whatever the number of threads and whichever comes first.
 void spline_gradient(const SplineGrid* grid, const SplineRows* rows, const int64_t* slab_start, int64_t slabs,
                      const double* target, const int64_t* number, const double* x, double* out) {
-  const SplineGrid& g = *grid;
-  const int local = local_size(g);
-  const size_t size = size_t(local) * g.components;
-  const PullCell pull = pull_cell_for(g);
-  for (int parity = 0; parity < 2; ++parity) {
-#pragma omp parallel if (rows->count > kWorthThreads)
-    {
-      std::vector<double> row(size), near(size), pulled(size);
-#pragma omp for schedule(dynamic, 1)
-      for (int64_t slab = parity; slab < slabs; slab += 2) {
-        for (int64_t cell = slab_start[slab]; cell < slab_start[slab + 1]; ++cell) {
-          if (rows->start[cell] == rows->start[cell + 1]) continue;
-          const int32_t* position = g.position + cell * local;
-          if (x) gather(g, position, local, x, near.data());
-          std::fill(pulled.begin(), pulled.end(), 0.0);
-          pull(g, *rows, cell, target, number, x ? near.data() : nullptr, row.data(), pulled.data());
-          scatter_add(g, position, local, pulled.data(), out);
-        }
-      }
-    }
-  }
+  guard::call([&] { gradient(grid, rows, slab_start, slabs, target, number, x, out); });
 }
 
-// Counting sort: number[place] is the row at each place when rows are sorted by their slot, equal ones in their order;
-// start (slots + 1) the first place of each slot.
 void spline_sort(const int64_t* slot, int64_t count, int64_t slots, int64_t* number, int64_t* start) {
-  std::fill_n(start, slots + 1, 0);
-  for (int64_t n = 0; n < count; ++n) ++start[slot[n] + 1];
-  for (int64_t s = 0; s < slots; ++s) start[s + 1] += start[s];
-  std::vector<int64_t> next(start, start + slots);
-  for (int64_t n = 0; n < count; ++n) number[next[slot[n]]++] = n;
+  guard::call([&] { sort(slot, count, slots, number, start); });
 }
 
 }  // extern "C"

@@ -10,13 +10,12 @@ import torch.multiprocessing as multiprocessing
 
 import geometry
 import torchsph
-from torchsph import EnsembleOptions, Estimated, PreparedMeasurement, Simulator, assimilate, estimate_error, preset
+from torchsph import EnsembleOptions, Estimated, PreparedMeasurement, Simulator, assimilate, preset
 from torchsph.assimilation import Parameter
 from torchsph.data import sample_measurement, sample_truth
 from torchsph.methods.ensemble.cycle import Cycle
 from torchsph.methods.ensemble.divergence_cleaning import Cleaned
 from torchsph.methods.ensemble.forecaster import Ensemble, Forecaster
-from torchsph.methods.measurement.observation_operator import Measurement
 from torchsph.methods.runtime.watching import FrameDone
 from torchsph.methods.runtime.watching import Stopped as AskedToStop
 from torchsph.simulator.scene import Scene
@@ -351,11 +350,10 @@ def test_observations_noisier_than_said_are_noticed(given, fine):
 def test_an_observation_that_claims_to_be_exact_is_refused_by_name(given):
     sigma = np.full_like(given.measured.velocity, 0.05)
     sigma[1] = 0.0
-    told = replace(given.measured, sigma=sigma)
-    error = estimate_error(told, given.prepared.splines, given.smoothed)
-    measurement = Measurement(PreparedMeasurement(told, error=error), told.grid)
-    with pytest.raises(ValueError, match="zero or negative, which makes the gain singular"):
-        measurement.see(1)
+    with pytest.raises(
+        geometry.RecordingError, match=r"/sigma: must be positive .* as at frame 1, .* leave /sigma out"
+    ):
+        PreparedMeasurement(replace(given.measured, sigma=sigma))
 
 
 @pytest.mark.slow

@@ -100,5 +100,5 @@ def test_particles_that_join_are_trusted():
 
 
 def test_confidence_must_not_be_negative():
-    with pytest.raises(ValueError, match="confidences must be finite and not negative"):
+    with pytest.raises(ValueError, match="confidence must be finite and not negative, but is -0.5"):
         started(ramp() - 0.5)

@@ -151,7 +151,7 @@ def test_each_member_is_controlled_for_itself():
     even = lattice(2)
     both = particles(place, mass, vortex(place, 24))
     other = particles(even, torch.ones(len(even), dtype=torch.float64), vortex(even, 24))
-    start = Particles(**{**both._arrays()}, members=2).joined(other.changed(member=other.member + 1))
+    start = Particles(**{**both.arrays()}, members=2).joined(other.changed(member=other.member + 1))
     run = simulator(*SCHEMES[0]).resume(start, 0.0)
     alone = simulator(*SCHEMES[0]).resume(both, 0.0)
     for due in ([True, True], [False, True]):

@@ -18,7 +18,7 @@ from torchsph.methods import by_name
 from torchsph.methods.runtime import checkpoint, parallel
 
 from ..arguments import add_model_options, add_output_folder, add_seed, names, whole
-from ..checks import check_spacing, usable_device
+from ..checks import check_spacing, informative, usable_device
 from ..command import Command
 from ..outputs import output_folder, staged, write_json
 from ..printing import print_table, run_config, say
@@ -73,8 +73,8 @@ def assimilate(args: argparse.Namespace) -> None:
     held = locked(folder) if lead else nullcontext(folder)
     with held, StatusFile(args.status if lead else None) as status, StopSignals() as signals:
         account = provenance(args, {"measurement": measured_path, "truth": truth_path, "also": args.also})
-        measured = geometry.read_recording(measured_path)
-        also = [geometry.read_recording(path) for path in args.also]
+        measured = informative(geometry.read_recording(measured_path), measured_path)
+        also = [informative(geometry.read_recording(path), path) for path in args.also]
         truth = None if truth_path is None else geometry.read_recording(truth_path)
         check_spacing(args.spacing, measured)
         raw = metrics.evaluate(measured, truth, measured)  # first: a truth that does not fit must not cost a run

@@ -116,8 +116,20 @@ def summary_table(recording: geometry.Recording) -> list[list[str]]:
     time, grid = np.asarray(recording.time), recording.grid
     speed = np.linalg.norm(metrics.filled_velocity(recording), axis=1)[np.asarray(recording.mask, bool)]
     intervals = recording.valve_intervals_or_derived()
-    optional = ("weight", "sigma", "uncovered", "quality", "beam", "pressure", "volume", "flux_mitral", "flux_aortic")
+    optional = (
+        "weight",
+        "sigma",
+        "uncovered",
+        "quality",
+        "beam",
+        "pressure",
+        "volume",
+        "flux_mitral",
+        "flux_aortic",
+        "valve_leak",
+    )
     present = [name for name in optional if getattr(recording, name) is not None]
+    present += [flux.dataset.strip("/") for flux in recording.fluxes]
     rows = [
         ["recording", "valid"],
         ["description", recording.description or "-"],

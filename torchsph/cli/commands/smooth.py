@@ -8,7 +8,7 @@ import geometry
 from torchsph.evaluation import figures, metrics
 from torchsph.methods.measurement.frame_splines import smooth as smooth_recording
 
-from ..checks import full_vectors, output_file
+from ..checks import full_vectors, informative, output_file
 from ..command import Command
 from ..printing import print_table, say
 from ..running.notes import shows_bar
@@ -24,6 +24,7 @@ def smooth(args: argparse.Namespace) -> None:
     """`torchsph smooth`: a B-spline field for each frame."""
     path = output_file(args.out)
     measured = full_vectors(geometry.read_recording(args.measurement), args.measurement)
+    informative(measured, args.measurement, weighed=False)
     smoothed = smooth_recording(measured, progress=shows_bar(args))
     geometry.write_recording(path, smoothed, provenance=provenance(args, {"measurement": args.measurement}))
     scores = {name: metrics.evaluate(one, None, measured) for name, one in (("raw", measured), ("spline", smoothed))}

@@ -22,6 +22,7 @@ from tqdm import tqdm
 import geometry
 from torchsph.assimilation import LETKF, RTPS, Filter, Localisation
 from torchsph.simulator.simulator import Simulator
+from torchsph.simulator.transfer.checks import check_grid
 
 from ..measurement.observation_operator import Measurement
 from ..measurement.prepared import PreparedMeasurement
@@ -88,7 +89,8 @@ def assimilate(
         The analyses, with their claimed deviation and the accounts of the run.
 
     Raises:
-        ValueError: fewer than two members, or a checkpoint of another run.
+        ValueError: fewer than two members, a simulator or a truth of another grid than the measurement's, or a
+            checkpoint of another run.
         NumericalFailure: all simulations failed, or fewer are alive than ``options.minimum_members``.
         Stopped: the watcher asked for it; the checkpoint holds all frames that were done.
     """
@@ -98,6 +100,11 @@ def assimilate(
         raise ValueError("resume needs the file of checkpoints that the run before wrote")
     options = EnsembleOptions() if options is None else options
     coarse = model if coarse is None else coarse
+    given = measured if isinstance(measured, geometry.Recording) else measured.recording
+    for one in (model, coarse):
+        check_grid(given.grid, one.scene.dimension)
+    if truth is not None and truth.grid.shape != given.grid.shape:
+        raise ValueError(f"the truth has a grid of {truth.grid.shape} nodes, the measurement one of {given.grid.shape}")
     first = PreparedMeasurement.of(measured, progress=progress)
     prepared = [first, *(further(other, first) for other in also)]
     grid = first.recording.grid

@@ -17,7 +17,10 @@ import regularize
 from regularize.solvers.factor import Factor
 
 from ..runtime.parallel import shared
-from .wall_rows import at_knots, wall_rows
+from .flux_data import flux_data
+from .informative import refuse_silent
+from .wall_rows import at_knots, mean_certainty, open_regions, wall_rows
+from .wall_trust import wall_trust
 
 # noise and smoothness are chosen in every third frame and serve its neighbours: flow and noise change over tens of
 # milliseconds, and a choice costs four times a fit
@@ -52,6 +55,7 @@ class FrameSmoother:
     ) -> None:
         if choose_every < 1:
             raise ValueError(f"choose_every must be at least 1, got {choose_every}")
+        refuse_silent(recording)
         self.estimates = geometry.estimated(recording) if estimates is None else estimates
         recording = self.estimates.recording
         self.type = geometry.measurement_type(recording)
@@ -62,12 +66,13 @@ class FrameSmoother:
         self.motion: geometry.WallMotion | None = None
         self._sampler: geometry.WallSampler | None = None
         if recording.wall is not None:
-            self.motion = geometry.WallMotion.from_recording(recording)
+            self.motion = _motion(recording)
             if smoother.nodes is None:
                 self.motion, self._sampler = at_knots(self.motion, max(smoother.knots_at(recording.grid.spacing)))
         self.recording, self.smoother, self.choose_every = recording, smoother, choose_every
         self.nodes = recording.grid.nodes()
         self._choices: dict[int, regularize.Choice | None] = {}
+        self._trust: dict[int, float] = {}  # by group, as the choices
 
     def warn(self) -> None:
         """Warn of all that walls and valves were believed otherwise than the recording has them."""
@@ -83,12 +88,16 @@ class FrameSmoother:
             return None
         group = frame // self.choose_every
         if group not in self._choices:
-            first = group * self.choose_every
-            members = range(first, min(first + self.choose_every, self.recording.frames))
-            from_middle = sorted(members, key=lambda k: abs(k - first - self.choose_every // 2))
-            middle = next((k for k in from_middle if self.measures(k)), None)
+            middle = self._middle(group)
             self._choices[group] = None if middle is None else self._fit(middle).choice
         return self._choices[group]
+
+    def _middle(self, group: int) -> int | None:
+        """The middle frame of a group, or the nearest to it that measured anything; None where none did."""
+        first = group * self.choose_every
+        members = range(first, min(first + self.choose_every, self.recording.frames))
+        from_middle = sorted(members, key=lambda k: abs(k - first - self.choose_every // 2))
+        return next((k for k in from_middle if self.measures(k)), None)
 
     def fit(self, frame: int, *, uncertainty: bool = False) -> regularize.SplineField:
         """The spline of one frame; ``uncertainty`` keeps what its standard deviation needs.
@@ -154,14 +163,32 @@ class FrameSmoother:
         """Rows of the walls at a frame; None where the recording has no wall."""
         if self.motion is None:
             return None
-        return wall_rows(self.recording, self.motion, frame, at_rest=at_rest, sampler=self._sampler)
+        return wall_rows(
+            self.recording,
+            self.motion,
+            frame,
+            at_rest=at_rest,
+            sampler=self._sampler,
+            knots=self._knots,
+            free=self.estimates.contradicted,
+        )
+
+    @property
+    def _knots(self) -> float:
+        """Knot distance, m; 0 where the smoother counts coefficients instead."""
+        return 0.0 if self.smoother.nodes is not None else max(self.smoother.knots_at(self.recording.grid.spacing))
 
     def _inside(self, frame: int) -> Tensor:
         """(n, D) nodes in the mask of a frame."""
         return self.nodes[torch.from_numpy(np.array(self.recording.mask[frame], bool).reshape(-1))]
 
     def _fit(
-        self, frame: int, *, uncertainty: bool = False, choice: regularize.Choice | None = None
+        self,
+        frame: int,
+        *,
+        uncertainty: bool = False,
+        choice: regularize.Choice | None = None,
+        walls: bool = True,
     ) -> regularize.SplineField:
         recording, dimension = self.recording, self.recording.dimension
         mask = torch.from_numpy(np.array(recording.mask[frame], bool).reshape(-1))
@@ -174,16 +201,64 @@ class FrameSmoother:
         samples = torch.from_numpy(np.nan_to_num(field, copy=True)).double().T
         components = self.type.at(frame, torch.nonzero(used).squeeze(1))
         points, rows, confidence, beam = components.spline_rows(self.nodes[used], samples[used], weight[used])
-        return self.smoother.fit(
+        together = self._open_together(frame)
+        known_flux = walls and (bool(recording.fluxes) or bool(together)) and self.type.full
+        smoother = self._trusting(frame) if walls else self.smoother
+        fitted = smoother.fit(
             points,
             rows,
             confidence,
-            self._walls(frame),
+            self._walls(frame) if walls else None,
             divergence_points=self.nodes[mask],
             beam=beam,
-            uncertainty=uncertainty,
+            uncertainty=uncertainty or known_flux,
             choice=choice,
         )
+        return self._with_fluxes(fitted, frame, together, uncertainty=uncertainty) if known_flux else fitted
+
+    def _open_together(self, frame: int) -> tuple[int, ...]:
+        """Regions at a frame whose fluxes are the data's to say, their sum dV/dt; () where walls alone tell it.
+
+        That is where several are open, and where the velocities tell of another flow than the walls.
+        """
+        if self.motion is None:
+            return ()
+        regions = open_regions(self.recording, float(self.recording.time[frame]))
+        return regions if len(regions) > 1 or self.estimates.contradicted else ()
+
+    def _trusting(self, frame: int) -> regularize.Smoother:
+        """The smoother with the strength that the walls of a frame deserve: less where they are uncertain."""
+        smoother, group = self.smoother, frame // self.choose_every
+        if self.motion is None or not smoother.wall:
+            return smoother
+        if group not in self._trust:
+            self._trust[group] = 1.0
+            middle = self._middle(group)
+            if smoother.automatic and middle is not None and self._open_together(middle):
+                free, rows = self._fit(middle, uncertainty=True, walls=False), self._walls(middle)
+                self._trust[group] = 1.0 if rows is None else wall_trust(free, rows, smoother.wall)
+        trust = self._trust[group] * mean_certainty(self.recording, frame, self._knots)
+        return smoother if trust == 1.0 else replace(smoother, wall=smoother.wall * trust**0.5)
+
+    def _with_fluxes(
+        self, fitted: regularize.SplineField, frame: int, together: tuple[int, ...], *, uncertainty: bool
+    ) -> regularize.SplineField:
+        """The spline with what is known of the fluxes through its openings."""
+        wall, data = self.estimates.wall, None
+        rate_sigma = 0.0 if wall is None else float(wall.rate_sigma[frame])
+        if self.motion is not None:
+            if self.estimates.flow is not None and self.estimates.contradicted:
+                # the walls' own error cannot be less than what the velocities have against them
+                against = abs(1 - self.estimates.flow.ratio) * self.motion.volume_rate(
+                    float(self.recording.time[frame])
+                )
+                rate_sigma = max(rate_sigma, abs(against))
+            data = flux_data(self.recording, self.motion, frame, fitted, together, rate_sigma)
+        if data is not None:
+            fitted = regularize.with_linear_data(fitted, data)
+        if not uncertainty:
+            fitted.posterior = fitted.factor = None  # they take as much memory as all else together
+        return fitted
 
     @property
     def groups(self) -> int:
@@ -242,6 +317,14 @@ class FrameSmoother:
         out = np.zeros((grid.dimension, grid.size), np.float32)
         out[:, mask] = fitted(self.nodes[torch.from_numpy(mask)], outside=0.0).T.numpy()
         return out.reshape(grid.dimension, *grid.shape)
+
+
+def _motion(recording: geometry.Recording) -> geometry.WallMotion:
+    """The motion of the walls; one frame alone is as fast as it says it is, though nobody knows where it goes."""
+    motion, wall = geometry.WallMotion.from_recording(recording), recording.wall_for("splines")
+    if motion.moves or wall.velocity is None:
+        return motion
+    return replace(motion, rates_at_keys=wall.velocity[:1].astype(np.float64))
 
 
 def smooth(

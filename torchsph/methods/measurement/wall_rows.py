@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import torch
+from scipy.spatial import cKDTree
 
 import geometry
 from regularize import WallRows
@@ -14,10 +15,13 @@ FEWEST = 1000  # points below which it saves nothing
 
 
 def open_regions(recording: geometry.Recording, time: float) -> tuple[int, ...]:
-    """Regions of the orifices that are open at ``time`` (s), in ascending order."""
+    """Regions of the orifices that are open at ``time`` (s), or leak, in ascending order."""
     rows = recording.valve_intervals_or_derived()
-    present = set(np.unique(recording.wall_for("open orifices").region).tolist())
-    return tuple(sorted({int(r) for r, opens, closes in rows if opens <= time < closes and int(r) in present}))
+    passing = {int(r) for r, opens, closes in rows if opens <= time < closes}
+    if recording.valve_leak is not None:
+        passing |= {int(r) for r, part in recording.valve_leak if part > 0}
+    present = np.unique(recording.wall_for("open orifices").region).tolist()
+    return tuple(sorted(passing & set(present)))
 
 
 def at_knots(motion: geometry.WallMotion, knots: float) -> tuple[geometry.WallMotion, geometry.WallSampler | None]:
@@ -45,12 +49,17 @@ def wall_rows(
     *,
     at_rest: bool = False,
     sampler: geometry.WallSampler | None = None,
+    knots: float = 0.0,
+    free: bool = False,
 ) -> WallRows:
     """One row per wall point at a frame, weighted by area.
 
+    A wall that stands sigma from where it is said to stand (``/wall/sigma``) tells of the flow there what a spline
+    changes by over sigma, so that its rows weigh 1 / (1 + (sigma / knots)^2) times as much beside the others; what that
+    makes of all of them is ``mean_certainty``.
+
     An orifice that alone is open carries the flux dV/dt as a plug. Where several are open, how they share it is for the
-    data to say: they have no rows, and that their fluxes sum to dV/dt follows from the rows of the shut wall and of the
-    divergence.
+    data to say: they have no rows, and that their fluxes sum to dV/dt is an equation of its own (``flux_data``).
 
     Args:
         recording: whose frame and valves it is.
@@ -58,6 +67,8 @@ def wall_rows(
         frame: its number.
         at_rest: every velocity zero, the rows of an increment between two fields that both obey the walls.
         sampler: points on the wall; None: one in the middle of each face, with its exact area and normal.
+        knots: m, knot distance of the splines, which an uncertain wall is held against.
+        free: leave a single open orifice to the data as well.
     """
     time = float(recording.time[frame])
     surface = motion.surface(time)
@@ -67,18 +78,36 @@ def wall_rows(
     else:
         points = sampler.at(time)
     velocity, regions = points.velocities, open_regions(recording, time)
-    if len(regions) == 1:
+    plug = len(regions) == 1 and not free
+    if plug:
         vector = surface.area_vectors[surface.part(regions[0])].sum(0)
         area = float(np.linalg.norm(vector))
         velocity[points.region == regions[0]] += -motion.volume_rate(time) / area * vector / area
     no_slip = ~np.isin(points.region, regions)
-    good = (points.areas > 0) & (no_slip | (len(regions) == 1))
+    good = (points.areas > 0) & (no_slip | plug)
 
     def tensor(values: np.ndarray) -> torch.Tensor:
         return torch.from_numpy(np.ascontiguousarray(values[good]))
 
     if at_rest:
         velocity = np.zeros_like(velocity)
-    return WallRows(
-        tensor(points.points), tensor(points.normals), tensor(velocity), tensor(points.areas), tensor(no_slip)
-    )
+    weight = points.areas * _certainty(recording, frame, points.points, knots)
+    return WallRows(tensor(points.points), tensor(points.normals), tensor(velocity), tensor(weight), tensor(no_slip))
+
+
+def _certainty(recording: geometry.Recording, frame: int, points: np.ndarray, knots: float) -> np.ndarray | float:
+    """Factor (n,) on the rows at points (n, D): 1 where the wall is certain."""
+    wall = recording.wall_for("wall rows")
+    if wall.sigma is None or knots <= 0:
+        return 1.0
+    sigma = wall.sigma if wall.sigma.ndim == 1 else wall.sigma[frame]
+    # points may stand between the recording's own vertices: the nearest one's deviation is theirs
+    nearest = cKDTree(wall.at(frame).vertices).query(points)[1]
+    return 1.0 / (1.0 + (sigma[nearest].astype(np.float64) / knots) ** 2)
+
+
+def mean_certainty(recording: geometry.Recording, frame: int, knots: float) -> float:
+    """Mean factor on the rows of a frame's walls: 1 where ``/wall/sigma`` is not given."""
+    surface = recording.wall_for("wall rows").at(frame)
+    each = _certainty(recording, frame, surface.centroids, knots)
+    return each if isinstance(each, float) else float((each * surface.areas).sum() / surface.areas.sum())

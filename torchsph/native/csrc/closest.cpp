@@ -10,6 +10,7 @@
 #include <cstdint>
 #include <vector>
 
+#include "guard.hpp"
 #include "interface.h"
 
 namespace {
@@ -284,8 +285,5 @@ class Closest {
 }  // namespace
 
 extern "C" void sph_grid_closest(const sph_closest* arguments) {
-  if (arguments->dimension == 2)
-    Closest<2>(*arguments).run();
-  else
-    Closest<3>(*arguments).run();
+  guard::call([&] { arguments->dimension == 2 ? Closest<2>(*arguments).run() : Closest<3>(*arguments).run(); });
 }

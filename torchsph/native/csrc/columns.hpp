@@ -10,6 +10,7 @@
 #include <cmath>
 #include <cstdint>
 #include <limits>
+#include <stdexcept>
 #include <vector>
 
 #include "finite.hpp"
@@ -141,10 +142,13 @@ std::int64_t survey(const Shape& shape, const Real* position, Columns<Real>& c) 
     empty.most[d] = std::numeric_limits<double>::lowest();
   }
   c.box.assign(members, empty);
+  // made before the region, which no lack of memory may leave
+  std::vector<std::vector<Box>> boxes(shape.threads, std::vector<Box>(members, empty));
+  std::vector<std::vector<std::int64_t>> counts(shape.threads, std::vector<std::int64_t>(members, 0));
 #pragma omp parallel num_threads(shape.threads)
   {
-    std::vector<Box> box(members, empty);
-    std::vector<std::int64_t> count(members, 0);
+    std::vector<Box>& box = boxes[omp_get_thread_num()];
+    std::vector<std::int64_t>& count = counts[omp_get_thread_num()];
 #pragma omp for schedule(static) nowait
     for (std::int64_t i = 0; i < n; ++i) {
       const std::int64_t m = shape.member[i];
@@ -172,6 +176,8 @@ std::int64_t survey(const Shape& shape, const Real* position, Columns<Real>& c) 
 template <class Real, int D> void sort_into_bins(const Shape& shape, Columns<Real>& c) {
   const std::int64_t n = shape.particles, bins = c.table;
   const int threads = int(std::min<std::int64_t>(shape.threads, std::max<std::int64_t>(1, n / 4096)));
+  if (bins > std::numeric_limits<std::int32_t>::max())
+    throw std::overflow_error("the search's table has more cells than an int32 can number");
   c.bin_of.resize(n);
   c.order.resize(n);
   c.start.resize(bins + 1);
@@ -220,6 +226,8 @@ template <class Real, int D> void cut_clusters(const Shape& shape, Columns<Real>
     }
   first_cluster[column] = clusters;
   c.clusters = clusters;
+  if (c.slots() + slack > std::numeric_limits<std::int32_t>::max())
+    throw std::overflow_error("the search has more slots than an int32 can number");
   c.slot.resize(c.slots());
   c.owner.resize(clusters);
   for (int d = 0; d < D; ++d) c.at[d].resize(c.slots() + slack);

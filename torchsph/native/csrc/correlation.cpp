@@ -12,8 +12,10 @@
 #include <complex>
 #include <cstdint>
 #include <limits>
+#include <optional>
 #include <vector>
 
+#include "guard.hpp"
 #include "interface.h"
 #include "lanes.hpp"
 
@@ -245,15 +247,23 @@ class Correlator {
 
 template <class Real>
 void correlate(const sph_correlation& a) {
+  guard::Rescue rescue;
 #pragma omp parallel num_threads(a.threads)
   {
-    Correlator<Real> own(a);
+    std::optional<Correlator<Real>> own;
+    const bool ready = rescue.run([&] { own.emplace(a); });
 #pragma omp for schedule(dynamic, 8)
-    for (int64_t point = 0; point < a.points; ++point) own.run(point);
+    for (int64_t point = 0; point < a.points; ++point)
+      if (ready) own->run(point);
   }
+  rescue.rethrow();
 }
 
 }  // namespace
 
-extern "C" void sph_correlate_f32(const sph_correlation* arguments) { correlate<float>(*arguments); }
-extern "C" void sph_correlate_f64(const sph_correlation* arguments) { correlate<double>(*arguments); }
+extern "C" void sph_correlate_f32(const sph_correlation* arguments) {
+  guard::call([&] { correlate<float>(*arguments); });
+}
+extern "C" void sph_correlate_f64(const sph_correlation* arguments) {
+  guard::call([&] { correlate<double>(*arguments); });
+}

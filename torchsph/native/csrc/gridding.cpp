@@ -6,6 +6,7 @@
 #include <cstdint>
 
 #include "finite.hpp"
+#include "guard.hpp"
 #include "interface.h"
 #include "lanes.hpp"
 
@@ -142,8 +143,10 @@ void gather(const sph_gridding& a) {
 
 #define SPH_GRIDDING(name, Real, suffix)                                     \
   extern "C" void sph_##name##suffix(const sph_gridding* arguments) {        \
-    const sph_gridding& a = *arguments;                                      \
-    a.width == 4 ? name<Real, 4>(a) : name<Real, 0>(a); /* 4: the default */ \
+    guard::call([&] {                                                        \
+      const sph_gridding& a = *arguments;                                    \
+      a.width == 4 ? name<Real, 4>(a) : name<Real, 0>(a); /* the default */  \
+    });                                                                      \
   }
 SPH_GRIDDING(spread, float, _f32)
 SPH_GRIDDING(spread, double, _f64)

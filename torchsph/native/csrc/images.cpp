@@ -11,6 +11,7 @@
 #include <limits>
 #include <vector>
 
+#include "guard.hpp"
 #include "interface.h"
 
 namespace {
@@ -109,11 +110,14 @@ template <class Real>
 void box_sums(const sph_boxes& a) {
   const auto* field = static_cast<const Real*>(a.field);
   auto* out = static_cast<Real*>(a.out);
+  guard::Rescue rescue;
 #pragma omp parallel num_threads(a.threads)
   {
-    std::vector<Real> sum(a.parts * (2 * a.reach[2] + 1));
+    std::vector<Real> sum;
+    const bool ready = rescue.run([&] { sum.resize(a.parts * (2 * a.reach[2] + 1)); });
 #pragma omp for schedule(static)
     for (int64_t p = 0; p < a.points; ++p) {
+      if (!ready) continue;
       const Box box(a, a.middle + 3 * p);
       const int64_t count = a.parts * (box.high[2] - box.low[2] + 1);
       std::fill(sum.begin(), sum.end(), Real(0));
@@ -129,11 +133,20 @@ void box_sums(const sph_boxes& a) {
       }
     }
   }
+  rescue.rethrow();
 }
 
 }  // namespace
 
-extern "C" void sph_arrange_f32(const sph_images* arguments) { Arranger<float>(*arguments).run(); }
-extern "C" void sph_arrange_f64(const sph_images* arguments) { Arranger<double>(*arguments).run(); }
-extern "C" void sph_box_sums_f32(const sph_boxes* arguments) { box_sums<float>(*arguments); }
-extern "C" void sph_box_sums_f64(const sph_boxes* arguments) { box_sums<double>(*arguments); }
+extern "C" void sph_arrange_f32(const sph_images* arguments) {
+  guard::call([&] { Arranger<float>(*arguments).run(); });
+}
+extern "C" void sph_arrange_f64(const sph_images* arguments) {
+  guard::call([&] { Arranger<double>(*arguments).run(); });
+}
+extern "C" void sph_box_sums_f32(const sph_boxes* arguments) {
+  guard::call([&] { box_sums<float>(*arguments); });
+}
+extern "C" void sph_box_sums_f64(const sph_boxes* arguments) {
+  guard::call([&] { box_sums<double>(*arguments); });
+}

@@ -195,6 +195,7 @@ void sph_gather_f32(const sph_gridding*);
 void sph_gather_f64(const sph_gridding*);
 void sph_grid_closest(const sph_closest*);
 int sph_runs(const char* instruction_set);             /* whether this processor has it */
+int sph_fault(char* text, int64_t room); /* kind of the calling thread's last fault, see guard.hpp; 0: none */
 const sph_layout* sph_layouts(int64_t* count);
 double sph_fma(int threads, int64_t turns, float factor); /* float32 multiply-adds; the flop done */
 #pragma GCC visibility pop

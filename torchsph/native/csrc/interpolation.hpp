@@ -2,6 +2,7 @@
 //
 // Queries are sorted into the particles' columns and worked through in clusters of 8, as particles are.
 #pragma once
+#include "guard.hpp"
 #include "lists.hpp"
 #include "passes.hpp"
 
@@ -97,13 +98,15 @@ template <class Real, int D, bool Plain> struct Interpolation {
                     const Carried<Real>& carried, std::int64_t column, const Moments<Real>& out) {
     std::vector<Real> rows;
     pack(c, carried, column, shape.threads, rows);
+    guard::Rescue rescue;
 #pragma omp parallel num_threads(shape.threads)
     {
-      std::vector<std::int32_t> list(4096);
+      std::vector<std::int32_t> list;  // grows below, where a lack of memory is caught
 #pragma omp for schedule(dynamic, 16)
       for (std::int64_t g = 0; g < queries.clusters; ++g) {
         std::size_t size = 0;
-        list_cluster<Real, D>(c, queries.owner[g], queries.at, g * cluster_size, shape, list, size);
+        if (!rescue.run([&] { list_cluster<Real, D>(c, queries.owner[g], queries.at, g * cluster_size, shape, list, size); }))
+          continue;
         const double h = kernel.lengths[queries.owner[g]];
         const Real scale = Real(kernel.kernel.sigma / std::pow(h, D));
         for (int group = 0; group < L::groups; ++group) {
@@ -122,6 +125,7 @@ template <class Real, int D, bool Plain> struct Interpolation {
         }
       }
     }
+    rescue.rethrow();
   }
 };
 

@@ -6,6 +6,7 @@
 #include <atomic>
 
 #include "columns.hpp"
+#include "guard.hpp"
 #include "compaction.hpp"
 
 namespace sph {
@@ -137,23 +138,28 @@ std::int64_t list_all(const Columns<Real>& c, const Shape& shape, std::int64_t c
   constexpr std::int64_t chunk = 16;
   const std::int64_t chunks = (c.clusters + chunk - 1) / chunk;
   std::atomic<std::int64_t> used{0};
+  guard::Rescue rescue;
 #pragma omp parallel num_threads(shape.threads)
   {
-    std::vector<std::int32_t> buffer(4096);
+    std::vector<std::int32_t> buffer;  // grows below, where a lack of memory is caught
     std::int64_t begin[chunk];
 #pragma omp for schedule(dynamic, 2)
     for (std::int64_t k = 0; k < chunks; ++k) {
       const std::int64_t first = k * chunk, last = std::min(first + chunk, c.clusters);
       std::size_t size = 0;
-      for (std::int64_t g = first; g < last; ++g) {
-        begin[g - first] = std::int64_t(size);
-        list_cluster<Real, D>(c, c.owner[g], c.at, g * cluster_size, shape, buffer, size);
-      }
+      const bool listed = rescue.run([&] {
+        for (std::int64_t g = first; g < last; ++g) {
+          begin[g - first] = std::int64_t(size);
+          list_cluster<Real, D>(c, c.owner[g], c.at, g * cluster_size, shape, buffer, size);
+        }
+      });
+      if (!listed) continue;
       const std::int64_t at = used.fetch_add(std::int64_t(size));
       for (std::int64_t g = first; g < last; ++g) offset[g] = at + begin[g - first];
       if (at + std::int64_t(size) <= capacity) std::memcpy(entries + at, buffer.data(), size * sizeof(std::int32_t));
     }
   }
+  rescue.rethrow();
   return used.load();
 }
 

@@ -7,6 +7,7 @@
 #include <limits>
 
 #include "finite.hpp"
+#include "guard.hpp"
 #include "interface.h"
 
 namespace {
@@ -131,5 +132,9 @@ void run(const sph_look_up& a) {
 
 }  // namespace
 
-extern "C" void sph_look_up_f32(const sph_look_up* arguments) { run<float>(*arguments); }
-extern "C" void sph_look_up_f64(const sph_look_up* arguments) { run<double>(*arguments); }
+extern "C" void sph_look_up_f32(const sph_look_up* arguments) {
+  guard::call([&] { run<float>(*arguments); });
+}
+extern "C" void sph_look_up_f64(const sph_look_up* arguments) {
+  guard::call([&] { run<double>(*arguments); });
+}

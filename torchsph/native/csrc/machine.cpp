@@ -3,12 +3,15 @@
 
 #include <iterator>
 
+#include "guard.hpp"
 #include "interface.h"
 #include "lanes.hpp"
 #include "layouts.hpp"
 #include "processor.hpp"
 
 extern "C" int sph_runs(const char* instruction_set) { return processor_runs(instruction_set); }
+
+extern "C" int sph_fault(char* text, int64_t room) { return guard::read(text, room); }
 
 extern "C" const sph_layout* sph_layouts(int64_t* count) {
   *count = std::size(layouts);

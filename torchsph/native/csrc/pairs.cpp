@@ -4,6 +4,7 @@
 #include <iterator>
 #include <utility>
 
+#include "guard.hpp"
 #include "interpolation.hpp"
 #include "lists.hpp"
 #include "passes.hpp"
@@ -131,25 +132,31 @@ template <int D> std::int64_t interpolate(const sph_interpolation& p) {
 extern "C" {
 
 int SPH_NAME(sph_sort)(const sph_search* s, sph_sizes* sizes) {
-  const Real* position = static_cast<const Real*>(s->position);
-  const Shape shape = shape_of(*s);
-  sizes->unusable = s->dimension == 3 ? sort_columns<Real, 3>(shape, position, columns)
-                                      : sort_columns<Real, 2>(shape, position, columns);
-  sizes->clusters = columns.clusters;
-  sizes->members = columns.members;
-  return SPH_DONE;
+  return guard::call([&] {
+    const Real* position = static_cast<const Real*>(s->position);
+    const Shape shape = shape_of(*s);
+    sizes->unusable = s->dimension == 3 ? sort_columns<Real, 3>(shape, position, columns)
+                                        : sort_columns<Real, 2>(shape, position, columns);
+    sizes->clusters = columns.clusters;
+    sizes->members = columns.members;
+    return int(SPH_DONE);
+  });
 }
 
 int64_t SPH_NAME(sph_list)(const sph_search* s, int64_t capacity, sph_lists* out) {
-  return s->dimension == 3 ? lists<3>(*s, capacity, *out) : lists<2>(*s, capacity, *out);
+  return guard::call([&] { return s->dimension == 3 ? lists<3>(*s, capacity, *out) : lists<2>(*s, capacity, *out); });
 }
 
 int64_t SPH_NAME(sph_interpolate)(const sph_interpolation* p) {
-  return p->particles.dimension == 3 ? interpolate<3>(*p) : interpolate<2>(*p);
+  return guard::call([&] { return p->particles.dimension == 3 ? interpolate<3>(*p) : interpolate<2>(*p); });
 }
 
-int SPH_NAME(sph_poisson)(const sph_poisson* p) { return p->pass.dimension == 3 ? poisson<3>(*p) : poisson<2>(*p); }
+int SPH_NAME(sph_poisson)(const sph_poisson* p) {
+  return guard::call([&] { return p->pass.dimension == 3 ? poisson<3>(*p) : poisson<2>(*p); });
+}
 
-int SPH_NAME(sph_pass)(const sph_pass* p) { return p->dimension == 3 ? pass<3>(*p) : pass<2>(*p); }
+int SPH_NAME(sph_pass)(const sph_pass* p) {
+  return guard::call([&] { return p->dimension == 3 ? pass<3>(*p) : pass<2>(*p); });
+}
 
 }

@@ -5,6 +5,7 @@
 #include <cmath>
 #include <cstdint>
 
+#include "guard.hpp"
 #include "interface.h"
 #include "terms.hpp"
 
@@ -104,9 +105,21 @@ void run(const sph_walls& a, bool first) {
 
 }  // namespace
 
-extern "C" void sph_wall_rates_f32(const sph_walls* arguments) { run<float>(*arguments, true); }
-extern "C" void sph_wall_rates_f64(const sph_walls* arguments) { run<double>(*arguments, true); }
-extern "C" void sph_wall_forces_f32(const sph_walls* arguments) { run<float>(*arguments, false); }
-extern "C" void sph_wall_forces_f64(const sph_walls* arguments) { run<double>(*arguments, false); }
-extern "C" int64_t sph_wall_near_f32(const sph_walls* a) { return a->dimension == 2 ? near<float, 2>(*a) : near<float, 3>(*a); }
-extern "C" int64_t sph_wall_near_f64(const sph_walls* a) { return a->dimension == 2 ? near<double, 2>(*a) : near<double, 3>(*a); }
+extern "C" void sph_wall_rates_f32(const sph_walls* arguments) {
+  guard::call([&] { run<float>(*arguments, true); });
+}
+extern "C" void sph_wall_rates_f64(const sph_walls* arguments) {
+  guard::call([&] { run<double>(*arguments, true); });
+}
+extern "C" void sph_wall_forces_f32(const sph_walls* arguments) {
+  guard::call([&] { run<float>(*arguments, false); });
+}
+extern "C" void sph_wall_forces_f64(const sph_walls* arguments) {
+  guard::call([&] { run<double>(*arguments, false); });
+}
+extern "C" int64_t sph_wall_near_f32(const sph_walls* a) {
+  return guard::call([&] { return a->dimension == 2 ? near<float, 2>(*a) : near<float, 3>(*a); });
+}
+extern "C" int64_t sph_wall_near_f64(const sph_walls* a) {
+  return guard::call([&] { return a->dimension == 2 ? near<double, 2>(*a) : near<double, 3>(*a); });
+}

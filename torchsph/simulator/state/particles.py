@@ -75,11 +75,11 @@ class Particles:
 
     def select(self, keep: Tensor) -> Particles:
         """The particles where ``keep`` (N,) bool, or the indices in ``keep``."""
-        return self.changed(**{name: value[keep] for name, value in self._arrays().items()})
+        return self.changed(**{name: value[keep] for name, value in self.arrays().items()})
 
     def joined(self, other: Particles) -> Particles:
         """These particles followed by those of ``other``; where they lack them these get labels and full confidence."""
-        theirs = other._arrays()
+        theirs = other.arrays()
         if self.label is not None and other.label is None:
             first = int(self.label.max()) + 1 if self.count else 0
             theirs["label"] = torch.arange(first, first + other.count, device=self.label.device)
@@ -87,13 +87,13 @@ class Particles:
             theirs["confidence"] = torch.ones_like(other.mass)
         if other.pressure is None:
             theirs["pressure"] = torch.zeros_like(other.mass)
-        return self.changed(**{name: torch.cat([value, theirs[name]]) for name, value in self._arrays().items()})
+        return self.changed(**{name: torch.cat([value, theirs[name]]) for name, value in self.arrays().items()})
 
     def repeated(self, members: int) -> Particles:
         """``members`` copies of a single member, one after the other, without labels."""
         if self.members != 1:
             raise ValueError(f"only a single member can be repeated, this set has {self.members}")
-        copies = {n: value.repeat((members,) + (1,) * (value.ndim - 1)) for n, value in self._arrays().items()}
+        copies = {n: value.repeat((members,) + (1,) * (value.ndim - 1)) for n, value in self.arrays().items()}
         copies["member"] = torch.arange(members, device=self.member.device).repeat_interleave(self.count)
         return replace(self.changed(**copies), members=members, label=None)
 
@@ -128,7 +128,7 @@ class Particles:
             raise ValueError("particles without labels cannot be put in their order")
         return replace(self.select(torch.argsort(self.label, stable=True)), label=None)
 
-    def _arrays(self) -> dict[str, Tensor]:
+    def arrays(self) -> dict[str, Tensor]:
         """Everything that has one row a particle."""
         found = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "members"}
         return {name: value for name, value in found.items() if value is not None}

@@ -69,6 +69,8 @@ class Record:
         filling: volume of the particles inside over that of the cavity now; NaN in scenes without walls. Where a closed
             cavity changes its volume, it goes along: a weakly compressible fluid is compressed or thinned, and the
             incompressible scheme reports the mismatch below.
+        volume_error: largest departure of the filling from that at the start, relative to it, in a scene with valves,
+            where what enters and leaves should keep it (``failures.check_volume``).
         limited_by: how many steps each limit decided, (members, limits); names in ``LIMITS``.
         searches: neighbour searches, of all members together.
         reductions: how often a limit asked for a step shorter than the step before by more than a hundredth.
@@ -103,6 +105,7 @@ class Record:
     wall_work: Tensor = _account(0.0, taken_back=True)
     source_work: Tensor = _account(0.0, taken_back=True)
     filling: Tensor = _account(math.nan)
+    volume_error: Tensor = _account(0.0)
     limited_by: Tensor = _account(by="limits")
     searches: int = field(default=0, init=False)
     reductions: Tensor = _account()

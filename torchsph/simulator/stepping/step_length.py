@@ -57,6 +57,8 @@ class StepControl:
         active = left > 0
         frame = torch.full_like(limits[:1], longest)
         smallest, which = torch.cat([self._floored(limits, c, active), frame]).min(0)
+        # a member that is not finite breaks in this step; its time must not be lost, for the clock counts all members'
+        smallest = torch.where(smallest.isnan(), frame[0], smallest)
         smallest = smallest if factor is None else factor * smallest
         record.reductions += active & (smallest < 0.99 * self._last_limit)
         self._last_limit = torch.where(active, smallest, self._last_limit)

@@ -54,10 +54,12 @@ class ValveModel:
 
     Attributes:
         has_buffers: whether there can be particles that the valves move (``Particles.kind``).
+        buffers: openings behind which there can be particles that the valves move.
         does_work: whether ``acceleration`` may be other than None.
         takes_strength: whether a run's valve strength acts.
     """
 
+    buffers = 0
     has_buffers = False
     does_work = False
     takes_strength = False

@@ -51,6 +51,7 @@ class Reservoirs(ValveModel):
         self._flat, self._run_out, self.relaxation = model.profile == "flat", model.run_out, model.relaxation
         self._far = self._run_out + float(np.ceil(setting.support_radius) + 1.0)  # where the buffer ends
         self.openings = Openings(scene, setting.units, setting.device, setting.dtype)
+        self.buffers = len(self.openings.all)
         self.volume = CavityVolume(
             self.openings.motion,
             setting.units,

@@ -43,6 +43,12 @@ def _compiled(
     handle: ctypes.CDLL, grid: Grid, solid: Surface, values: np.ndarray, limit: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     dimension = grid.dimension
+    if max(grid.size, len(solid.faces)) > np.iinfo(np.int32).max:
+        raise ValueError(f"a wall table of {grid.size} nodes is more than an int32 can number; use a larger spacing")
+    if limit.shape != (grid.size,) or values.shape != solid.vertices.shape:
+        raise ValueError(
+            f"limits {limit.shape} and values {values.shape} are not those of {grid.size} nodes and the wall"
+        )
     distance, carried = np.empty(grid.size), np.zeros((grid.size, dimension))
     arrays: dict[str, np.ndarray] = {
         "vertices": np.ascontiguousarray(solid.vertices, np.float64),

@@ -58,8 +58,9 @@ class KeyTimes:
         if self.motion.period:
             # a time outside the key frames stands for one in the nearest period of them (WallMotion.locate)
             first, last, period = self.times[0], self.times[-1], self.motion.period
-            for beat in range(1, math.ceil(max(stop - last, first - start, 0.0) / period) + 1):
+            for beat in range(max(1, math.floor((start - last) / period)), math.ceil((stop - last) / period) + 1):
                 found += [t + beat * period for t in self.times if t > last - period]
+            for beat in range(max(1, math.floor((first - stop) / period)), math.ceil((first - start) / period) + 1):
                 found += [t - beat * period for t in self.times if t < first + period]
         return sorted({t for t in found if start <= t <= stop})
 

@@ -1,0 +1,104 @@
+"""What compiled code would read out of bounds, or compute nonsense from, is refused by its name where it enters."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import pytest
+import torch
+
+from regularize import CellRows, DirectionRows, Factor, InvalidInput, Knots, PreparedSystem, System, VectorRows
+from regularize.native import library as native
+from regularize.solvers.direct import solve_direct
+
+KNOTS = Knots((0.0, 0.0, 0.0), (0.005,) * 3, (2, 3, 2), 3)
+FINER = Knots((0.0, 0.0, 0.0), (0.0025,) * 3, (4, 6, 4), 3)
+DRAW = torch.Generator().manual_seed(0)
+POINTS = torch.rand(40, 3, generator=DRAW, dtype=torch.float64) * 0.01
+VALUES = torch.randn(40, 3, generator=DRAW, dtype=torch.float64)
+ONES = torch.ones(40, 3, dtype=torch.float64)
+
+
+def rows(knots: Knots = KNOTS, points: torch.Tensor = POINTS, values: torch.Tensor = VALUES) -> VectorRows:
+    return VectorRows(knots, points, values, ONES[: len(points), : values.shape[1]])
+
+
+def system(*blocks: object, knots: Knots = KNOTS, components: int = 3, damping: float = 1e-3) -> System:
+    return System(knots, components, blocks or (rows(knots),), damping)
+
+
+BAND = PreparedSystem(system()).band()
+ORDERING = PreparedSystem(system()).ordering
+FACTOR = Factor(BAND.clone(), ORDERING)
+RIGHT = torch.ones(len(ORDERING.nodes), 3, dtype=torch.float64)
+FAR = torch.where(torch.arange(40)[:, None] == 5, math.inf, POINTS)
+CELLS = torch.full((2, 3), 99)
+
+REFUSED: dict[str, tuple[Callable[[], object], str]] = {
+    "no component": (lambda: system(components=0), "needs a component"),
+    "other components": (lambda: system(rows(), components=2), "of 3 components, the system of 2"),
+    "other knots": (lambda: system(rows(), knots=FINER), "made for other knots"),
+    "no row": (lambda: system(rows(points=POINTS[:0], values=VALUES[:0])), "blocks without any row"),
+    "damping": (lambda: system(damping=math.nan), "finite damping"),
+    "meta rows": (lambda: system(rows(points=POINTS.to("meta"))), "points are of .* on 'meta'"),
+    "points far away": (lambda: rows(points=FAR), "points must be finite"),
+    "whole points": (lambda: rows(points=POINTS.long()), "points are of torch.int64"),
+    "values": (lambda: system(rows(values=math.nan * VALUES)), "target or weight that is not finite"),
+    "fewer values": (lambda: rows(values=VALUES[:5]), r"target has the shape \(5, 3\): it must be \(40, C\)"),
+    "directions": (lambda: DirectionRows(KNOTS, POINTS, VALUES[:3], VALUES[:, 0], ONES[:, 0]), r"\(40, C\) and"),
+    "cells": (lambda: system(CellRows(KNOTS, CELLS, ONES.new_ones(2, 64), 3)), "cells .99, 99, 99. to"),
+    "factor of cells": (lambda: CellRows(KNOTS, CELLS, ONES, 3), r"it must be \(rows, 64\)"),
+    "knots": (lambda: Knots((math.nan,) * 3, (0.005,) * 3, (2, 2, 2)), "all finite"),
+    "many knots": (lambda: Knots((0.0,) * 3, (1e-9,) * 3, (10**4,) * 3), "more than int32"),
+    "short band": (lambda: Factor(BAND[:5].clone(), ORDERING), "a row for each component of the"),
+    "narrow band": (lambda: Factor(BAND[:, :5].clone(), ORDERING), "the band is 5 wide, but its columns reach"),
+    "whole band": (lambda: Factor(BAND.long(), ORDERING), "the band is of torch.int64"),
+    "meta band": (lambda: Factor(BAND.to("meta"), ORDERING), "the band is on the device 'meta'"),
+    "strided band": (lambda: Factor(BAND.T.contiguous().T, ORDERING), "the band is not contiguous"),
+    "meta right": (lambda: FACTOR.solve(RIGHT.to("meta")), "the right-hand side has the shape .* on 'meta'"),
+    "short right": (lambda: FACTOR.solve(RIGHT[:5]), r"the right-hand side has the shape \(5, 3\)"),
+}
+NEEDS_COMPILED: dict[str, tuple[Callable[[], object], str]] = {
+    "reach": (lambda: native.factorise(BAND.clone(), 50 * FACTOR.reach), "reach must rise"),
+    "short reach": (lambda: native.factorise(BAND.clone(), FACTOR.reach[:3]), r"reach has the shape \(3,\)"),
+    "ordering": (lambda: PreparedSystem(system(knots=FINER), ORDERING).band(), "cells that the ordering"),
+    "smaller ordering": (
+        lambda: PreparedSystem(system(), PreparedSystem(system(rows(points=POINTS[:1], values=VALUES[:1]))).ordering),
+        "cells that the ordering does not hold",
+    ),
+    "gradient": (lambda: PreparedSystem(system()).gradient(RIGHT[:5]), r"x has the shape \(5, 3\)"),
+    "single gradient": (lambda: PreparedSystem(system()).gradient(RIGHT.float()), "x is of torch.float32"),
+    "fewer targets": (
+        lambda: PreparedSystem(system()).with_targets(system(rows(points=POINTS[:5], values=VALUES[:5]))).gradient(),
+        "the target of a block has the shape",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_it_is_refused(name: str) -> None:
+    call, words = REFUSED[name]
+    with pytest.raises(InvalidInput, match=words):
+        call()
+
+
+@pytest.mark.skipif(not native.available(), reason="no compiled library")
+@pytest.mark.parametrize("name", NEEDS_COMPILED)
+def test_it_is_refused_before_compiled_code(name: str) -> None:
+    call, words = NEEDS_COMPILED[name]
+    with pytest.raises(InvalidInput, match=words):
+        call()
+
+
+def test_more_components_than_compiled_code_has_room_for_are_solved_by_the_reference() -> None:
+    four = torch.cat([VALUES, VALUES[:, :1]], 1)
+    wide = System(KNOTS, 4, [VectorRows(KNOTS, POINTS, four, torch.ones_like(four))], 1e-3)
+    assert PreparedSystem(wide).engine == "reference"
+    found = solve_direct(wide).solution.x.view(KNOTS.nodes, 4)
+    alone = solve_direct(system()).solution.x.view(KNOTS.nodes, 3)
+    torch.testing.assert_close(found[:, :3], alone, rtol=1e-6, atol=1e-9)
+    torch.testing.assert_close(found[:, 3], found[:, 0])
+    if native.available():
+        with pytest.raises(InvalidInput, match="compiled code takes up to 3 components"):
+            PreparedSystem(wide, engine="native")

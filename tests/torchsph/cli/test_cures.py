@@ -1,0 +1,61 @@
+"""A fault in the middle of a run names the file and what the command's own options can do about it."""
+
+from __future__ import annotations
+
+import argparse
+
+import pytest
+import torch
+
+from torchsph.cli.command import Command
+from torchsph.cli.cures import late_fault
+from torchsph.cli.exit_codes import ExitCode, exit_code
+from torchsph.cli.main import main
+from torchsph.simulator.failures import NumericalFailure
+
+FULL = argparse.Namespace(measurement="m.h5", members=None, spacing=None, preset="default")
+
+
+def torch_s_own() -> BaseException:
+    """What torch raises where there is not enough memory, and where a size overflows."""
+    with pytest.raises(RuntimeError) as caught:
+        torch.empty(2**62, dtype=torch.float64)
+    return caught.value
+
+
+def test_memory_and_numbers() -> None:
+    memory = "m.h5: out of memory; try fewer --members or a larger --spacing"
+    for fault in (MemoryError(), MemoryError("out of memory in sph_list_f32; use less"), torch_s_own()):
+        assert exit_code(fault) is ExitCode.MEMORY
+        assert late_fault(fault, ExitCode.MEMORY, FULL) == memory
+    alone = argparse.Namespace(file="a.h5")
+    assert late_fault(MemoryError(), ExitCode.MEMORY, alone) == (
+        "a.h5: out of memory; close other programs, or use a larger machine"
+    )
+    failed = NumericalFailure("all 3 members have failed at about 0.3 s")
+    assert late_fault(failed, exit_code(failed), FULL) == (
+        "m.h5: all 3 members have failed at about 0.3 s; try another --spacing or another --preset"
+    )
+    sample = argparse.Namespace(measurement=None, spacing=None)
+    assert str(late_fault(failed, ExitCode.NUMERICAL, sample)).startswith("the sample: all 3")
+    assert late_fault(ValueError("x"), ExitCode.INPUT, FULL) is None
+    assert late_fault(MemoryError(), ExitCode.MEMORY, None) == "out of memory; " + (
+        "close other programs, or use a larger machine"
+    )
+
+
+@pytest.mark.parametrize(("fault", "code"), [(MemoryError(), 3), (NumericalFailure("all failed"), 4)])
+def test_the_command_line_says_it_in_one_line(
+    fault: BaseException, code: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from torchsph.cli import program
+
+    def failing(args: argparse.Namespace) -> None:
+        raise fault
+
+    info = next(command for command in program.COMMANDS if command.name == "info")
+    broken = Command("info", info.help, info.arguments, failing)
+    monkeypatch.setattr(program.parsed, "__defaults__", ((broken,),))
+    assert main(["info", "some.h5"]) == code
+    said = capsys.readouterr().err
+    assert said.startswith("torchsph info: error: some.h5: ") and said.count("\n") == 1

@@ -1,0 +1,49 @@
+"""Faults that come late, in the words of who runs a command: which file, what happened, what to do about it."""
+
+from __future__ import annotations
+
+import argparse
+
+from .exit_codes import ExitCode
+
+# what names the input, in the options of the commands
+_INPUTS = ("measurement", "recording", "analysis", "true", "file")
+_SAMPLE = "the sample"
+
+
+def late_fault(fault: BaseException, code: ExitCode, args: argparse.Namespace | None) -> str | None:
+    """What is said of a fault that no check before the work has found.
+
+    Args:
+        fault: what was raised.
+        code: the exit code that belongs to it.
+        args: the options of the command, where they were read.
+
+    Returns:
+        One line; None for faults that say all of it themselves.
+    """
+    if code is ExitCode.MEMORY:
+        return f"{_about(args)}out of memory; {_cure(args, _LESS) or 'close other programs, or use a larger machine'}"
+    if code is ExitCode.NUMERICAL:
+        cure = _cure(args, _CALMER)
+        return f"{_about(args)}{str(fault).rstrip('.')}{f'; {cure}' if cure else ''}"
+    return None
+
+
+# option -> what to do with it
+_LESS = {"members": "fewer --members", "spacing": "a larger --spacing"}
+_CALMER = {"spacing": "another --spacing", "preset": "another --preset"}
+
+
+def _cure(args: argparse.Namespace | None, ways: dict[str, str]) -> str:
+    """The ways that this command has."""
+    known = [words for option, words in ways.items() if hasattr(args, option)]
+    return f"try {' or '.join(known)}" if known else ""
+
+
+def _about(args: argparse.Namespace | None) -> str:
+    """The input that the command was working on."""
+    for name in _INPUTS:
+        if hasattr(args, name):
+            return f"{getattr(args, name) or _SAMPLE}: "
+    return ""
