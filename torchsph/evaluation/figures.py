@@ -28,6 +28,7 @@ from .scores import Scores  # noqa: E402
 __all__ = ["characteristic_frames", "draw_forecast", "draw_report", "scores_table"]
 
 COLUMNS = 5
+NOT_CLINICAL = "for research, not for clinical use"
 COLOURS = ("0.45", "tab:blue", "tab:orange", "tab:green", "tab:red", "tab:purple")
 HEADINGS = {
     "nrmse": "nrmse",
@@ -70,6 +71,7 @@ def draw_report(
     _draw_cuts(pictures, rows, slices.valve_plane(measured))
     _draw_curves(curves.subplots(), measured, truth, scores)
     _draw_table(table.subplots(), scores, seconds or {})
+    figure.text(0.995, 0.002, NOT_CLINICAL, fontsize=7, color="0.4", ha="right", va="bottom")
     figure.savefig(path, dpi=110)
     plt.close(figure)
 

@@ -162,6 +162,7 @@ def _write(
         say(f"ensemble: {words}")
     files = ", ".join(f"{name}.h5" for name in analyses)
     say(f"wrote {files}, analysis.h5 (= {config['analysis']}.h5), report.png and metrics.json to {folder}/")
+    say(figures.NOT_CLINICAL)
 
 
 def _inputs(args: argparse.Namespace) -> tuple[Path, Path | None, tuple[str, ...]]:

@@ -28,7 +28,8 @@ Curves = dict[str, NDArray[np.float64]]
 
 CAUTION = (
     "At 1 mm and 10 ms do not believe as they stand: wall shear stress, energy loss and vorticity (too small in smooth "
-    "fields, too large in raw ones), helicity; a mean field's kinetic energy is too small unless /sigma is there."
+    "fields, too large in raw ones), helicity; a mean field's kinetic energy is too small unless /sigma is there. "
+    "For research, not for clinical use."
 )
 
 

@@ -46,6 +46,7 @@ def provenance(args: argparse.Namespace, inputs: Inputs) -> dict[str, Any]:
         "fingerprint": fingerprint(args, digests),
         "dependencies": {name: _version(name) for name in DEPENDENCIES} | {"python": platform.python_version()},
         "machine": platform.platform(),
+        "use": "for research, not for clinical use",
     }
 
 
