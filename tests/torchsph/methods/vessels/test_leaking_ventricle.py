@@ -68,5 +68,4 @@ def test_the_leak_is_found_from_noisy_data_and_kept_in_the_forecast(leaking):
     share, error = split_and_error(body, ts.smooth(noisy(leaking, 0.1)))
     assert share == pytest.approx(SHARE, rel=0.1)
     _, without = split_and_error(tight, ts.smooth(noisy(recorded(tight), 0.1)))
-    print(share, error, without)
     assert error < 1.1 * without
