@@ -39,6 +39,11 @@ DEFAULT_MEMBERS = 16
 ANALYSIS_SPACING = 2.0
 CONTROL_SHARE = 0.5
 
+# Between frames that correct it, coarser particles resolve less in time as well: in a human ventricle with 3 and 6 mm,
+# steps of up to 0.7 spacings per m/s leave the ensemble's error as it is (.410, .409 with 0.7 ms) at 0.64 times the
+# cost. At 1 mm they are the preset's own.
+LONG_STEPS: dict[str, Any] = {"max_step": None, "longest_step": 0.7}
+
 
 @dataclass(frozen=True)
 class MethodResult:
@@ -67,7 +72,8 @@ def make_model(
         estimates: what ``geometry.estimated`` found of the recording, where that is known already.
     """
     scene = Scene.from_recording(recording, spacing, estimates=estimates)
-    return Simulator(scene, scheme_preset(preset), device=device)
+    scheme = scheme_preset(preset, **LONG_STEPS) if preset == "default" else scheme_preset(preset)
+    return Simulator(scene, scheme, device=device)
 
 
 def make_smoother(preset: str) -> regularize.Smoother:

@@ -183,7 +183,7 @@ def test_forecast(files, tmp_path):
     names = {"metrics.json", "config.toml", "forecast.png", "forecast_5ms.h5", "forecast_10ms.h5"}
     assert {path.name for path in (tmp_path / "out").iterdir()} == names
     document = json.loads((tmp_path / "out" / "metrics.json").read_text())
-    assert set(document) == {"leads", "seconds", "config"} and set(document["seconds"]) == {
+    assert set(document) == {"leads", "seconds", "config", "failures"} and set(document["seconds"]) == {
         "setup",
         "forecast",
     }
@@ -318,7 +318,7 @@ def test_fault_in_a_process_of_its_own(tmp_path):
     [
         (RuntimeError("the flow\nblew up"), 1, "RuntimeError: the flow blew up"),
         (MemoryError(), 3, "out of memory"),
-        (RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried"), 3, "can't allocate"),
+        (RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried"), 3, "try fewer --members"),
         (torchsph_package.NumericalFailure("all members failed"), 4, "all members failed"),
         (regularize.NotConverged("the solver"), 4, "the solver"),
         (Stopped("stopped by SIGTERM"), 75, "stopped by SIGTERM; run it again with --resume"),

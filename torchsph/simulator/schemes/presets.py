@@ -18,12 +18,10 @@ _THESIS_RATIO = 16 ** (1 / 3) / 3
 
 # Incompressible steps, for flow that fills a heart's chamber. Error over persistence's on a ventricle at 1 mm, 5 / 10 /
 # 20 / 40 ms ahead: .57 / .48 / .40 / .34 with steps of up to 0.7 ms; .59 / .50 / .41 / .35 with 1 ms at 0.75 times the
-# cost; weakly compressible .57 / .47 / .40 / .34 at 2.5 times. Coarser particles resolve less in time as well: in a
-# human ventricle with 3 and 6 mm, steps of up to 0.7 spacings per m/s leave the ensemble's error as it is (.410, .409
-# with 0.7 ms) at 0.64 times the cost. A slower relaxation stirs the fluid less, in pipes and vortices
-# (``validation.PERIODIC_PROJECTION``), but leaves a jet that fills a widening tube less even: error .076 with 2, .087
-# with 3, .103 with 6 spacings per reference speed, in a pipe of 10 spacings .0050, .0041 and .0033.
-_PROJECTION = Projection(max_step=None, longest_step=0.7, courant=0.4, tolerance=1.25e-2, relaxation=3.0)
+# cost; weakly compressible .57 / .47 / .40 / .34 at 2.5 times. A slower relaxation stirs the fluid less, in pipes and
+# vortices (``validation.PERIODIC_PROJECTION``), but leaves a jet that fills a widening tube less even: error .076 with
+# 2, .087 with 3, .103 with 6 spacings per reference speed, in a pipe of 10 spacings .0050, .0041 and .0033.
+_PROJECTION = Projection(max_step=7e-4, courant=0.4, tolerance=1.25e-2, relaxation=3.0)
 
 PRESETS: dict[str, Scheme] = {
     "default": _PROJECTION,
