@@ -167,7 +167,8 @@ def measured_flow(recording: Recording, motion: WallMotion, label: int) -> tuple
     for opening in (one for one in orifices(motion) if one.label == label):
         for frame, time in enumerate(recording.time):
             t = float(time)
-            near = (opening.height(nodes, t) <= 0) & (opening.height(nodes, t) > -depth)
+            height = opening.height(nodes, t)
+            near = (height <= 0) & (height > -depth)
             row = torch.nonzero(near).squeeze(1)
             row = row[opening.lateral_distance(nodes[row], t) > 0]
             seen = row.numpy()[np.asarray(recording.mask[frame]).reshape(-1)[row.numpy()]]

@@ -163,7 +163,7 @@ def predicted_memory(
     also: Sequence[geometry.Recording] = (),
 ) -> MemoryPrediction:
     """What ``run_methods`` with the same options will take."""
-    spacing = ANALYSIS_SPACING * min(prepared.recording.grid.spacing) if spacing is None else spacing
+    spacing = _spacing(prepared, spacing)
     simulated = set(methods) - {"spline"}
     runs = [(spacing, 1)] if simulated else []
     if "ensemble" in methods:
@@ -177,12 +177,17 @@ def predicted_memory(
     )
 
 
+def _spacing(prepared: PreparedMeasurement, asked: float | None) -> float:
+    """Of the particles of single runs and of the ensemble's members, m."""
+    return ANALYSIS_SPACING * min(prepared.recording.grid.spacing) if asked is None else asked
+
+
 class _Models:
     """The simulators of a measurement, each made when it is first asked for."""
 
     def __init__(self, prepared: PreparedMeasurement, preset: str, spacing: float | None, device: str) -> None:
         self.prepared, self.preset, self.device = prepared, preset, device
-        self.spacing = ANALYSIS_SPACING * min(prepared.recording.grid.spacing) if spacing is None else spacing
+        self.spacing = _spacing(prepared, spacing)
 
     @cached_property
     def coarse(self) -> Simulator:

@@ -228,8 +228,3 @@ class AdvancingRun:
         self._acceleration = rows_carried(self.particles, particles, self._acceleration)
         self.particles = particles
         self._stepper.pair_search.forget()
-
-    def _forget_pairs(self) -> None:
-        self._stepper.pair_search.forget()
-        if self._acceleration.shape != self.particles.position.shape:
-            self._acceleration = torch.zeros_like(self.particles.position)

@@ -10,13 +10,12 @@ from typing import Any
 import numpy as np
 
 import geometry
+from geometry.recordings.opening_flux import MOST_REGIONS
 
 # s: beyond every time of a recording
 _FOREVER = 1e12
 # m^3/s: a measured flux is never exact, however it is stated
 _LEAST_SIGMA = 1e-12
-# labels of faces are bytes
-_MOST_REGION = 255
 # openings and closings of a valve in one stretch of time: more are a slip in its period
 _MOST_BEATS = 100_000
 
@@ -75,9 +74,9 @@ class Valve:
     leak: float | None = None
 
     def __post_init__(self) -> None:
-        if self.region != int(self.region) or not 1 <= self.region <= _MOST_REGION:
+        if self.region != int(self.region) or not 1 <= self.region <= MOST_REGIONS:
             raise ValueError(
-                f"Valve.region must be a whole number from 1 (0 labels the wall) to {_MOST_REGION}, got {self.region}"
+                f"Valve.region must be a whole number from 1 (0 labels the wall) to {MOST_REGIONS}, got {self.region}"
             )
         for opening, closing in self.intervals:
             if not closing > opening:

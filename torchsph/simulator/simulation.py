@@ -77,7 +77,7 @@ class Simulation(AdvancingRun):
         self._coefficients = Coefficients.of(self.parameters, self.units, self.domain.scene.fluid.density)
         self._stepper.use(self._coefficients)
         self._stepper.pair_search.radius = self._stepper.support.radius
-        self._forget_pairs()
+        self._stepper.pair_search.forget()
 
     def impose(self, grid: Grid, velocity: Tensor, mask: Tensor, confidence: Tensor | None = None) -> None:
         """Replace the particles' velocities by those of a grid at the present time.
@@ -101,14 +101,13 @@ class Simulation(AdvancingRun):
             raise ValueError("mask holds no node: no velocity is known anywhere, so there is nothing to impose")
         if confidence is not None:
             check_weight("confidence", confidence, grid)
-        self.particles = self.surroundings.imposed(self.particles, grid, velocity, mask, self.time)
+        self._renumbered(self.surroundings.imposed(self.particles, grid, velocity, mask, self.time))
         carried = None
         if confidence is not None:
             field = confidence.to(self.particles.velocity)[None]
             carried = grid.sample(field, self.particles.position * self.units.length)[0].clamp_min(0.0)
         self.particles = replace(self.particles, confidence=carried)
         self._imposed_at = self.time
-        self._forget_pairs()
 
     @property
     def can_project(self) -> bool:

@@ -28,16 +28,14 @@ class SpatialSort:
 
     def begin(self, particles: Particles, acceleration: Tensor) -> tuple[Particles, Tensor]:
         """Particles and their accelerations (N, D) in the order of the last time, where there are many."""
-        if particles.count < _SORT_FROM or not bool(_large(particles).any()):
+        if _large(particles) is None:
             return particles, acceleration
         return self._sorted(particles.labelled(), acceleration, self.order)
 
     def when_due(self, particles: Particles, acceleration: Tensor) -> tuple[Particles, Tensor]:
         """The same sorted anew now and then, where the neighbours are to be searched anyway."""
-        if particles.count < _SORT_FROM:
-            return particles, acceleration
         due = _large(particles)
-        if not bool(due.any()):
+        if due is None:
             return particles, acceleration
         if self._sort_at is not None and self._search.renewed is not None:
             due &= self._search.renewed >= self._sort_at
@@ -73,9 +71,12 @@ class SpatialSort:
         return particles.by_label(), acceleration[back]
 
 
-def _large(particles: Particles) -> Tensor:
-    """(members,) bool: who has enough particles to be sorted."""
-    return torch.bincount(particles.member, minlength=particles.members) >= _SORT_FROM
+def _large(particles: Particles) -> Tensor | None:
+    """(members,) bool: who has enough particles to be sorted; None: nobody."""
+    if particles.count < _SORT_FROM:
+        return None
+    large = torch.bincount(particles.member, minlength=particles.members) >= _SORT_FROM
+    return large if bool(large.any()) else None
 
 
 def _of_members(members: Tensor, particles: Particles, order: Tensor | None) -> Tensor | None:

@@ -25,7 +25,7 @@ from ..printing import print_table, run_config, say
 from ..running.folder_lock import locked
 from ..running.notes import shows_bar
 from ..running.provenance import provenance
-from ..running.settings import config_text
+from ..running.settings import write_config
 from ..running.status import RunWatcher, StatusFile
 from ..running.stopping import StopSignals
 
@@ -104,7 +104,7 @@ def assimilate(args: argparse.Namespace) -> None:
         signals.waits = True  # what is left are seconds, and all the work is in them
         chosen = by_name.DEFAULT_METHOD if by_name.DEFAULT_METHOD in methods else methods[0]
         config = run_config(args, measured=measured_path, truth=truth_path, methods=methods, analysis=chosen)
-        _write(folder, measured, truth, results, raw, config, account, config_text(args))
+        _write(folder, measured, truth, results, raw, config, account, args)
         if "ensemble" in methods:
             saved.unlink(missing_ok=True)  # the run is complete: there is nothing to go on with
 
@@ -127,7 +127,7 @@ def _write(
     raw: Scores,
     config: dict[str, Any],
     account: dict[str, Any],
-    settings: str,
+    args: argparse.Namespace,
 ) -> None:
     """Score, draw and write the results; print what they are worth.
 
@@ -139,7 +139,7 @@ def _write(
         raw: the measurement's own scores.
         config: what was asked for.
         account: where the results come from.
-        settings: all options as a file.
+        args: all options of the run.
     """
     analyses = {name: result.recording for name, result in results.items()}
     scores = {"raw": raw} | {name: metrics.evaluate(each, truth, measured) for name, each in analyses.items()}
@@ -155,7 +155,7 @@ def _write(
         figures.draw_report(scratch / "report.png", measured, analyses, scores, truth, seconds)
         if "ensemble" in results:
             filter_figure(results["ensemble"].info["filter"]).savefig(scratch / "filter.png", dpi=110)
-        (scratch / "config.toml").write_text(settings, encoding="utf-8", errors="backslashreplace")
+        write_config(scratch, args)
         write_json(scratch / "metrics.json", metrics_document(measured, scores, seconds, config))
     print_table(figures.scores_table(scores, seconds))
     for words in results["ensemble"].info["filter"]["warnings"] if "ensemble" in results else ():

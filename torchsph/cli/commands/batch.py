@@ -15,7 +15,7 @@ from ..exit_codes import ExitCode
 from ..outputs import output_folder, write_json
 from ..printing import print_table, say
 from ..running.child import Outcome, run_child
-from ..running.isolated import LEAST_MEMORY, SECONDS_TO_READ, TIMES_SIZE, isolated
+from ..running.isolated import SECONDS_TO_READ, isolated, memory_to_read
 from ..running.items import Item, listed
 from ..running.provenance import fingerprint, input_digests
 from ..running.settings import as_arguments
@@ -107,7 +107,7 @@ def _finished(folder: Path) -> str | None:
 
 def _read_apart(source: Path) -> None:
     """Refuse a recording whose reading fails, hangs or crashes, at the cost of a fork."""
-    memory = LEAST_MEMORY + TIMES_SIZE * source.stat().st_size
+    memory = memory_to_read(source)
     isolated(lambda: bool(geometry.read_recording(source)), str(source), seconds=SECONDS_TO_READ, memory=memory)
 
 

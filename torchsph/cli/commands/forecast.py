@@ -20,7 +20,7 @@ from ..printing import print_table, run_config, say
 from ..running.folder_lock import locked
 from ..running.notes import shows_bar
 from ..running.provenance import provenance
-from ..running.settings import config_text
+from ..running.settings import write_config
 
 # lead times in s where none are named
 LEADS = (0.005, 0.01, 0.02, 0.04)
@@ -67,7 +67,7 @@ def forecast(args: argparse.Namespace) -> None:
         for lead, saved in skill.recordings.items():
             geometry.write_recording(scratch / f"forecast_{1e3 * lead:g}ms.h5", saved, provenance=account)
         figures.draw_forecast(scratch / "forecast.png", skill.leads)
-        (scratch / "config.toml").write_text(config_text(args), encoding="utf-8", errors="backslashreplace")
+        write_config(scratch, args)
         found = {"leads": skill.leads, "seconds": skill.seconds, "config": config, "failures": skill.failures}
         write_json(scratch / "metrics.json", found)
     rows = [["lead ms", "starts", "model", "persistence"]]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 from collections.abc import Mapping, Sequence
 from functools import partial
-from pathlib import Path
 from typing import Any, TypedDict
 
 import numpy as np
@@ -18,7 +17,7 @@ from ..arguments import number
 from ..command import Command
 from ..findings import tell_findings
 from ..printing import print_table
-from ..running.isolated import LEAST_MEMORY, SECONDS_TO_READ, TIMES_SIZE, isolated
+from ..running.isolated import SECONDS_TO_READ, isolated, memory_to_read
 from ..running.notes import LOGGER
 
 
@@ -62,9 +61,8 @@ def info(args: argparse.Namespace) -> None:
     if not args.isolated:
         _show(_looked_at(args.file, args.strict))
         return
-    memory = LEAST_MEMORY + TIMES_SIZE * Path(args.file).stat().st_size
-    found = isolated(partial(_looked_at, args.file, args.strict), args.file, seconds=args.seconds, memory=memory)
-    _show(found)
+    look = partial(_looked_at, args.file, args.strict)
+    _show(isolated(look, args.file, seconds=args.seconds, memory=memory_to_read(args.file)))
 
 
 def _looked_at(file: str, strict: bool) -> Looked:

@@ -22,7 +22,7 @@ from ..command import Command
 from ..outputs import output_folder, staged, write_json
 from ..running.folder_lock import locked
 from ..running.provenance import provenance
-from ..running.settings import config_text
+from ..running.settings import write_config
 
 Curves = dict[str, NDArray[np.float64]]
 
@@ -64,7 +64,7 @@ def quantify(args: argparse.Namespace) -> None:
     }
     with locked(folder), staged(folder) as scratch:
         write_json(scratch / "quantities.json", document)
-        (scratch / "config.toml").write_text(config_text(args), encoding="utf-8", errors="backslashreplace")
+        write_config(scratch, args)
         _write_csv(scratch / "quantities.csv", recording.time, fields)
     for row in _table(fields, numbers):
         print("  ".join(cell.ljust(34) if n == 0 else cell.rjust(12) for n, cell in enumerate(row)).rstrip())

@@ -11,15 +11,21 @@ import signal
 import sys
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import TypeVar
 
 T = TypeVar("T")
 
 # what the reading of a file may take: s; bytes, and as many for each of its own
 SECONDS_TO_READ = 120.0
-LEAST_MEMORY, TIMES_SIZE = 2 << 30, 50
+_LEAST_MEMORY, _TIMES_SIZE = 2 << 30, 50
 
 _KINDS: tuple[type[Exception], ...] = (MemoryError, FileNotFoundError, OSError, ValueError)
+
+
+def memory_to_read(file: str | Path) -> int:
+    """Bytes that the reading of a file may take."""
+    return _LEAST_MEMORY + _TIMES_SIZE * Path(file).stat().st_size
 
 
 def isolated(work: Callable[[], T], what: str, *, seconds: float, memory: int) -> T:

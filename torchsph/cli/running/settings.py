@@ -108,6 +108,11 @@ def config_text(args: argparse.Namespace) -> str:
     return "\n".join(lines) + "\n"
 
 
+def write_config(folder: Path, args: argparse.Namespace) -> None:
+    """Write `config.toml`, all options of a run, beside its results."""
+    (folder / "config.toml").write_text(config_text(args), encoding="utf-8", errors="backslashreplace")
+
+
 def _toml(value: Any) -> str:
     if isinstance(value, bool):
         return "true" if value else "false"

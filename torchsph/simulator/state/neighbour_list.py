@@ -102,7 +102,12 @@ def same_rows(before: Particles, after: Particles) -> tuple[Tensor, Tensor]:
 
 
 def rows_carried(before: Particles, after: Particles, values: Tensor) -> Tensor:
-    """Values (N, D) of ``before`` in the rows of ``after``; zeros in members whose particles are not the same."""
+    """Values (N, D) of ``before`` in the rows of ``after``; zeros in members whose particles are not the same.
+
+    Values that do not belong to ``before``, which somebody has put in the place of others, are zeros for all.
+    """
+    if len(values) != before.count:
+        return torch.zeros_like(after.position)
     if before is after or before.position is after.position:
         return values
     old, new = same_rows(before, after)

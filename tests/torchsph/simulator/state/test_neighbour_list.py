@@ -56,3 +56,8 @@ def test_accelerations_are_carried_where_nothing_changed():
     assert not bool(carried[fewer.member == 1].any())
     swapped = first.select(torch.tensor([1, 0, *range(2, 12)]))  # as many, elsewhere
     assert not bool(rows_carried(first, swapped, values)[:4].any())
+
+
+def test_accelerations_of_other_particles_are_not_carried():
+    """Somebody has put in more particles than were stepped last."""
+    assert rows_carried(lattice(3), lattice(3), torch.ones(4, 2)).tolist() == [[0.0, 0.0]] * 12
