@@ -9,12 +9,12 @@ import torch
 from torch import Tensor
 
 from geometry import Grid, OrificePlane, Surface, WallMotion, grid_winding, orifices
+from geometry.motion.key_times import KeyTimes
 from torchsph.pairs.smoothing_kernels import SmoothingKernel
 
 from .closest import closest_on_grid
 from .completeness import KernelCompleteness
 from .interface import CompleteWallSample, WallSample
-from .key_times import KeyTimes
 from .look_up import LookUp, by_node
 
 # look-up spacing in particle spacings: half of it resolves the kernel's completeness to a percent (test_walls)
