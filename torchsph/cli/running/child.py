@@ -51,7 +51,8 @@ def run_child(arguments: Sequence[str], log: Path, limit: float | None = None) -
     try:
         start = os.fstat(handle).st_size
         call = [sys.executable, "-m", "torchsph", *arguments]
-        late, came = False, []
+        late = False
+        came: list[int] = []
         with _held(came):
             process = subprocess.Popen(call, stdin=subprocess.DEVNULL, stdout=handle, stderr=handle)
         try:
