@@ -20,7 +20,7 @@ from .look_up import LookUp, by_node
 # look-up spacing in particle spacings: half of it resolves the kernel's completeness to a percent (test_walls)
 _FIELD_SPACING = 0.5
 # distances outside the wall are exact this far (spacings): particles are put back long before
-_STRAY = 2.0
+STRAY = 2.0
 # this far beyond the kernel's reach (spacings) the kernel is complete and nothing else of the wall is asked for
 _FAR = 1.0
 # fields kept: the beat is run through in order, and a forecast of 40 ms spans about ten of them
@@ -124,7 +124,7 @@ class WallFields:
         inside = (grid_winding(self.grid, surface.vertices, surface.faces) > 0).reshape(-1)
         shut = ~np.isin(surface.region, open_regions)
         solid = Surface(surface.vertices, surface.faces[shut], surface.region[shut])
-        limit = np.where(inside, self.reach + 0.5 + _FIELD_SPACING, _STRAY) * self.spacing
+        limit = np.where(inside, self.reach + 0.5 + _FIELD_SPACING, STRAY) * self.spacing
         distance, carried = closest_on_grid(self.grid, solid, self.motion.velocity(time), limit)
         np.negative(distance, out=distance, where=~inside)
         depth = (self.reach + 2.0) * self.spacing
