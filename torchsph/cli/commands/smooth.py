@@ -24,7 +24,7 @@ def smooth(args: argparse.Namespace) -> None:
     """`torchsph smooth`: a B-spline field for each frame."""
     path = output_file(args.out)
     measured = full_vectors(geometry.read_recording(args.measurement), args.measurement)
-    informative(measured, args.measurement, weighed=False)
+    informative(measured, args.measurement)
     smoothed = smooth_recording(measured, progress=shows_bar(args))
     geometry.write_recording(path, smoothed, provenance=provenance(args, {"measurement": args.measurement}))
     scores = {name: metrics.evaluate(one, None, measured) for name, one in (("raw", measured), ("spline", smoothed))}
