@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time as clock
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -24,7 +23,7 @@ from .free_run import run_freely
 from .measurement.prepared import PreparedMeasurement
 from .memory import MemoryPrediction, free_memory, predicted
 from .nudging import filter_sph
-from .runtime import checkpoint
+from .runtime.checkpoint import Saved
 from .runtime.parallel import from_last, is_last, is_lead
 from .runtime.watching import Watcher
 
@@ -93,7 +92,7 @@ def run_methods(
     lag: int | None = None,
     minimum_members: int | None = None,
     checkpoints: str | Path | None = None,
-    resume: bool = False,
+    resume: bool | Saved = False,
     watcher: Watcher | None = None,
     seed: int = 0,
     device: str = "cpu",
@@ -124,6 +123,8 @@ def run_methods(
     predicted_memory(prepared, methods, preset, models.spacing, count, also).refuse_beyond(free_memory())
     ensemble = None
     if "ensemble" in methods:
+        if resume is True and checkpoints is not None and is_lead():
+            resume = Saved.read(Path(checkpoints)) or True
         ensemble = _EnsembleCall(
             prepared,
             models,
@@ -217,12 +218,12 @@ class _EnsembleCall:
     options: EnsembleOptions
     truth: geometry.Recording | None
     checkpoints: Path | None
-    resume: bool
+    resume: bool | Saved
     seed: int
 
     def refuse_foreign_checkpoint(self) -> None:
         """Tell another run's checkpoint before splines and free runs have taken their minutes."""
-        if not self.resume or self.checkpoints is None or not is_lead() or not os.path.lexists(self.checkpoints):
+        if not isinstance(self.resume, Saved):
             return
         key = ensemble_key(
             [self.prepared, *(further(one, self.prepared) for one in self.also)],
@@ -234,7 +235,7 @@ class _EnsembleCall:
             seed=self.seed,
             truth=self.truth,
         )
-        checkpoint.refuse_foreign(self.checkpoints, key)
+        self.resume.refuse_foreign(key)
 
     def run(self, watcher: Watcher | None, progress: bool) -> EnsembleRun:
         """The ensemble's analyses."""
