@@ -37,6 +37,8 @@ DEFAULT_MEMBERS = 16
 # particle spacing in grid spacings of the single runs and of the ensemble's members; its control run takes half of it
 ANALYSIS_SPACING = 2.0
 CONTROL_SHARE = 0.5
+# of a recording's frames, what forecasts from them hold at once beside those that are saved
+FORECAST_COPIES = 2
 
 # Between frames that correct it, coarser particles resolve less in time as well: in a human ventricle with 3 and 6 mm,
 # steps of up to 0.7 spacings per m/s leave the ensemble's error as it is (.410, .409 with 0.7 ms) at 0.64 times the
@@ -170,12 +172,22 @@ def predicted_memory(
     if "ensemble" in methods:
         runs = [(spacing, min(members, EnsembleOptions().batch)), (CONTROL_SHARE * spacing, 1)]
     return predicted(
-        prepared,
+        prepared.recording,
         scheme_preset(preset),
+        splines=prepared.splines,
         spacings=runs,
         members=members if "ensemble" in methods else 0,
         further=also,
     )
+
+
+def predicted_forecast_memory(
+    recording: geometry.Recording, saved: Sequence[float] = (), preset: str = "default", spacing: float | None = None
+) -> MemoryPrediction:
+    """What ``forecast_skill`` with the same options will take, where the forecasts at the leads ``saved`` are kept."""
+    spacing = min(recording.grid.spacing) if spacing is None else spacing
+    copies = FORECAST_COPIES + 2 * len(saved)
+    return predicted(recording, scheme_preset(preset), spacings=[(spacing, 1)], copies=copies)
 
 
 def _spacing(prepared: PreparedMeasurement, asked: float | None) -> float:
@@ -294,8 +306,13 @@ def forecast_skill(
     progress: bool = False,
     seed: int = 0,
 ) -> ForecastSkill:
-    """Skill of the simulator on a recording; see ``skill``. ``spacing`` (m) defaults to the grid's."""
+    """Skill of the simulator on a recording; see ``skill``. ``spacing`` (m) defaults to the grid's.
+
+    Raises:
+        NotEnoughMemory: more would be needed than is free.
+    """
     began = clock.perf_counter()
+    predicted_forecast_memory(recording, leads if save else (), preset, spacing).refuse_beyond(free_memory())
     model = make_model(recording, preset=preset, spacing=spacing, device=device)
     made = clock.perf_counter() - began
     result = skill(recording, model, leads, every=every, save=save, progress=progress, seed=seed)
