@@ -168,7 +168,7 @@ class AdvancingRun:
 
         Particles that have crossed an open valve change sides in every step: the flow must not feel the search.
         """
-        particles, renumbered = self.surroundings.exchange(self.particles, self.record, self._stepper.pressure)
+        particles, renumbered = self.surroundings.exchange(self.particles, self.record, self._stepper.pressure, active)
         if self._population is not None:
             particles, changed = self._population.controlled_when_due(particles, active)
             renumbered |= changed
@@ -176,7 +176,7 @@ class AdvancingRun:
             self._acceleration = rows_carried(self.particles, particles, self._acceleration)
         self.particles = particles
         if self._pressures is not None:
-            self.particles = self._pressures.driven(self.particles, self.surroundings.clock, self._stepper)
+            self.particles = self._pressures.driven(self.particles, self.surroundings.clock, self._stepper, active)
         self.particles, self._acceleration = self._spatial.when_due(self.particles, self._acceleration)
 
     def _take_step(self, step: Tensor, done: Tensor, earlier: RollbackStates | None) -> Tensor:

@@ -78,9 +78,9 @@ def assimilate(args: argparse.Namespace) -> None:
         truth = None if truth_path is None else geometry.read_recording(truth_path)
         check_spacing(args.spacing, measured)
         raw = metrics.evaluate(measured, truth, measured)  # first: a truth that does not fit must not cost a run
-        saved = folder / "checkpoint.pt"
+        saved, resume = folder / "checkpoint.pt", args.resume
         if "ensemble" in methods and lead:
-            _check_checkpoint(saved, args.resume)
+            resume = _kept(saved, args.resume)
         with parallel.joined():
             results = by_name.run_methods(
                 measured,
@@ -93,7 +93,7 @@ def assimilate(args: argparse.Namespace) -> None:
                 also=also,
                 truth=truth,
                 checkpoints=saved,
-                resume=args.resume,
+                resume=resume,
                 watcher=RunWatcher(signals, status),
                 seed=args.seed,
                 device=device,
@@ -109,14 +109,14 @@ def assimilate(args: argparse.Namespace) -> None:
             saved.unlink(missing_ok=True)  # the run is complete: there is nothing to go on with
 
 
-def _check_checkpoint(saved: Path, resume: bool) -> None:
-    """Refuse, before any work, a checkpoint that cannot be gone on from, and a file that one would replace."""
+def _kept(saved: Path, resume: bool) -> bool | checkpoint.Saved:
+    """What to go on from, refused before any work where it cannot be; also refused is a file that would be replaced."""
     if resume:
-        checkpoint.refuse_damaged(saved)
-        return
+        return checkpoint.Saved.read(saved) or True
     checkpoint.refuse_other_file(saved)
     if saved.exists():
         say(f"{saved}: an earlier run was interrupted; this one begins anew and replaces it (--resume goes on with it)")
+    return False
 
 
 def _write(

@@ -6,7 +6,9 @@ import argparse
 
 import geometry
 from torchsph.evaluation import figures, metrics
-from torchsph.methods.measurement.frame_splines import smooth as smooth_recording
+from torchsph.methods.by_name import predicted_memory
+from torchsph.methods.measurement.prepared import PreparedMeasurement
+from torchsph.methods.memory import free_memory
 
 from ..checks import full_vectors, informative, output_file
 from ..command import Command
@@ -24,8 +26,10 @@ def smooth(args: argparse.Namespace) -> None:
     """`torchsph smooth`: a B-spline field for each frame."""
     path = output_file(args.out)
     measured = full_vectors(geometry.read_recording(args.measurement), args.measurement)
-    informative(measured, args.measurement, weighed=False)
-    smoothed = smooth_recording(measured, progress=shows_bar(args))
+    informative(measured, args.measurement)
+    prepared = PreparedMeasurement(measured, progress=shows_bar(args))
+    predicted_memory(prepared, ("spline",)).refuse_beyond(free_memory())
+    smoothed = prepared.smoothed
     geometry.write_recording(path, smoothed, provenance=provenance(args, {"measurement": args.measurement}))
     scores = {name: metrics.evaluate(one, None, measured) for name, one in (("raw", measured), ("spline", smoothed))}
     print_table(figures.scores_table(scores, {}))

@@ -27,6 +27,7 @@ from torchsph.simulator.transfer.checks import check_grid
 from ..measurement.observation_operator import Measurement
 from ..measurement.prepared import PreparedMeasurement
 from ..runtime import checkpoint
+from ..runtime.checkpoint import Saved
 from ..runtime.parallel import anywhere
 from ..runtime.watching import FrameDone, Stopped, Watcher
 from .accounts import accounts_of
@@ -62,7 +63,7 @@ def assimilate(
     also: Sequence[geometry.Recording | PreparedMeasurement] = (),
     truth: geometry.Recording | None = None,
     checkpoints: str | Path | None = None,
-    resume: bool = False,
+    resume: bool | Saved = False,
     watcher: Watcher | None = None,
     seed: int = 0,
     progress: bool = False,
@@ -79,7 +80,7 @@ def assimilate(
             the forecast at its own time and enters the next analysis.
         truth: for the scores in the record alone. It never enters an analysis.
         checkpoints: file to which every cycle writes its state.
-        resume: go on from it where it is there.
+        resume: go on from it where it is there; or the checkpoint itself, where it was read already.
         watcher: is told of every frame, and may ask the run to stop; in one process or in all of them.
         seed: of everything random. Under ``torch.distributed`` the processes share the simulations; the result is the
             same for any number of them.
@@ -111,8 +112,9 @@ def assimilate(
     filter = default_filter(first.recording, options) if filter is None else filter
     key = ensemble_key(prepared, model, coarse, filter, options, members=members, seed=seed, truth=truth)
     path = None if checkpoints is None else Path(checkpoints)
-    if resume and path is not None:
-        checkpoint.refuse_foreign(path, key)  # before the splines and error models that the cycle begins with
+    saved = Saved.read(path) if resume is True and path is not None else resume or None
+    if saved is not None:
+        saved.refuse_foreign(key)  # before the splines and error models that the cycle begins with
     cycle = Cycle(
         [Measurement(each, grid, options.kernel) for each in prepared],
         Forecaster(model, coarse, grid, options.transfer, batch=options.batch, seed=seed),
@@ -122,7 +124,7 @@ def assimilate(
         truth=truth,
         seed=seed,
     )
-    state = checkpoint.load(path, key) if resume and path is not None else None
+    state = checkpoint.shared_state(saved, key) if resume else None
     if state is not None:
         cycle.restore(state)
     _run(cycle, path, key, progress, watcher)
