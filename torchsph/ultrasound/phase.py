@@ -96,9 +96,9 @@ def _detected(packet: Packet) -> IQPhase:
     if max(found.baseband, found.carrier) >= FITS:
         return IQPhase.BASEBAND if found.baseband >= found.carrier else IQPhase.CARRIER
     raise ValueError(
-        f"iq: its phase runs along the beams at {found.carriers:.2f} times the carrier's 4 pi f / c, where 0 (baseband)"
-        " or 1 (carrier left in) is known; look at frequency, sound speed, the beams' direction and whether the samples "
-        "are complex conjugates, or state the packet's phase"
+        f"iq: its phase runs along the beams at {found.carriers:.2f} times the carrier's 4 pi f / c, where 0 "
+        "(baseband) or 1 (carrier left in) is known; look at frequency, sound speed, the beams' direction and whether "
+        "the samples are complex conjugates, or state the packet's phase"
     )
 
 

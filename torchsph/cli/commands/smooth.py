@@ -8,8 +8,10 @@ import geometry
 from torchsph.evaluation import figures, metrics
 from torchsph.methods.measurement.frame_splines import smooth as smooth_recording
 
+from ..arguments import add_sidecar
 from ..checks import full_vectors, informative, output_file
 from ..command import Command
+from ..outputs import write_analysis
 from ..printing import print_table, say
 from ..running.notes import shows_bar
 from ..running.provenance import provenance
@@ -18,6 +20,7 @@ from ..running.provenance import provenance
 def _arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("measurement", metavar="MEASUREMENT.h5")
     parser.add_argument("--out", required=True, metavar="SMOOTH.h5", help="the smoothed recording")
+    add_sidecar(parser)
 
 
 def smooth(args: argparse.Namespace) -> None:
@@ -26,7 +29,8 @@ def smooth(args: argparse.Namespace) -> None:
     measured = full_vectors(geometry.read_recording(args.measurement), args.measurement)
     informative(measured, args.measurement, weighed=False)
     smoothed = smooth_recording(measured, progress=shows_bar(args))
-    geometry.write_recording(path, smoothed, provenance=provenance(args, {"measurement": args.measurement}))
+    account = provenance(args, {"measurement": args.measurement})
+    write_analysis(path, smoothed, account, sidecar=not args.no_sidecar)
     scores = {name: metrics.evaluate(one, None, measured) for name, one in (("raw", measured), ("spline", smoothed))}
     print_table(figures.scores_table(scores, {}))
     say(f"wrote {len(smoothed.time)} frames to {path}")
