@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
 
@@ -46,11 +48,13 @@ class AdvancingRun:
         parameters: the numbers of the scheme in use.
         record: accounts of the run.
         time: present time, s.
+        observers: each is called after every step with the members (B,) bool that took it and their times (B,), s.
     """
 
     def __init__(self, domain: Domain, backend: Backend, particles: Particles, time: float) -> None:
         self.domain, self.units, self.particles, self.time = domain, domain.units, particles, float(time)
         self.surroundings, self._backend = PresentSurroundings(domain), backend
+        self.observers: list[Callable[[Tensor, Tensor], None]] = []
         scene, scheme = domain.scene, domain.scheme
         self.record = Record(particles.members, len(scene.valves), particles.position.device)
         self.parameters = Parameters.of(scheme, scene.fluid.viscosity)
@@ -150,6 +154,8 @@ class AdvancingRun:
             self.surroundings.at(self.time + done * self.units.time)
             self._prepare_step(step > 0)
             done = self._take_step(step, done, earlier)
+            for observer in self.observers:
+                observer((step > 0) & ~self.record.failed, self.time + done * self.units.time)
 
     def _ramp(self, done: Tensor) -> None:
         """Let gamma grow, where the scheme has it grow."""

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import geometry
+from geometry.formats import write_sidecar
 from torchsph import data
 from torchsph.assimilation import filter_figure
 from torchsph.evaluation import figures, metrics
@@ -17,7 +18,7 @@ from torchsph.evaluation.scores import Scores
 from torchsph.methods import by_name
 from torchsph.methods.runtime import checkpoint, parallel
 
-from ..arguments import add_model_options, add_output_folder, add_seed, names, whole
+from ..arguments import add_model_options, add_output_folder, add_seed, add_sidecar, names, whole
 from ..checks import check_spacing, informative, usable_device
 from ..command import Command
 from ..outputs import output_folder, staged, write_json
@@ -58,6 +59,7 @@ def add_method_options(parser: argparse.ArgumentParser) -> None:
         "--minimum-members", type=whole(1), metavar="N", help="end the run where fewer live through a forecast (1)"
     )
     add_seed(parser)
+    add_sidecar(parser)
 
 
 def assimilate(args: argparse.Namespace) -> None:
@@ -66,8 +68,8 @@ def assimilate(args: argparse.Namespace) -> None:
     Under torchrun the processes share the ensemble's simulations; the first one writes and prints.
     """
     measured_path, truth_path, methods = _inputs(args)
-    files = [f"{name}.h5" for name in methods]
-    folder = output_folder(args.out, [*files, "analysis.h5", "report.png", "filter.png", "metrics.json", "config.toml"])
+    files = [f"{name}{end}" for name in (*methods, "analysis") for end in (".h5", ".vtkhdf", "_wall.vtkhdf")]
+    folder = output_folder(args.out, [*files, "report.png", "filter.png", "metrics.json", "config.toml"])
     device = parallel.own_device(usable_device(args.device))
     lead = parallel.is_lead()
     held = locked(folder) if lead else nullcontext(folder)
@@ -152,6 +154,8 @@ def _write(
         for name, recording in analyses.items():
             geometry.write_recording(scratch / f"{name}.h5", recording, provenance=account | {"method": name})
         shutil.copyfile(scratch / f"{config['analysis']}.h5", scratch / "analysis.h5")
+        for name in () if args.no_sidecar else (*analyses, "analysis"):
+            write_sidecar(scratch / f"{name}.h5", analyses[config["analysis"] if name == "analysis" else name])
         figures.draw_report(scratch / "report.png", measured, analyses, scores, truth, seconds)
         if "ensemble" in results:
             filter_figure(results["ensemble"].info["filter"]).savefig(scratch / "filter.png", dpi=110)
