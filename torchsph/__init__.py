@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from .methods.measurement.prepared import PreparedMeasurement as PreparedMeasurement
     from .methods.nudging import FilteredRun, filter_sph
     from .pairs.smoothing_kernels import KERNELS, SmoothingKernel, kernel
+    from .report.write import write_report
     from .simulator.failures import NumericalFailure
     from .simulator.grid_forecast import GridForecast, Transfer
     from .simulator.residual_motion import ResidualMotion, residual_motion
@@ -85,6 +86,7 @@ __all__ = [
     "run_methods",
     "skill",
     "smooth",
+    "write_report",
 ]
 
 # where each public name lives, as the imports above have it
@@ -125,6 +127,7 @@ _HOMES = {
         "SmoothingKernel",
         "kernel",
     ),
+    "report.write": ("write_report",),
     "simulator.failures": ("NumericalFailure",),
     "simulator.grid_forecast": (
         "GridForecast",
@@ -173,6 +176,7 @@ _ROOMS = (
     "methods",
     "native",
     "pairs",
+    "report",
     "simulator",
     "ultrasound",
     "validation",

@@ -9,7 +9,7 @@ from torchsph import __version__
 
 from .arguments import Parser
 from .command import Command
-from .commands import assimilate, batch, collect, convert, export, forecast, info, measure, quantify, smooth
+from .commands import assimilate, batch, collect, convert, export, forecast, info, measure, quantify, report, smooth
 from .running.notes import add_notes_options
 from .running.settings import config_named, take_config
 
@@ -21,6 +21,7 @@ COMMANDS: tuple[Command, ...] = (
     measure.COMMAND,
     smooth.COMMAND,
     quantify.COMMAND,
+    report.COMMAND,
     info.COMMAND,
     convert.COMMAND,
     export.COMMAND,

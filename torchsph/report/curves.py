@@ -1,7 +1,8 @@
 """Curves over time for a page: quantities of a flow with their bands, and measures of the methods.
 
 Quantities come as `torchsph quantify` writes them: for each source (`analysis`, `truth`) and each name either the
-values over time, or a mapping with `mean` (or `value`) and, from members, `p05` and `p95`, and perhaps their own `time`.
+values over time, or a mapping with `mean` (or `value`) and, from members, `p05` and `p95`, and perhaps a `time` of its
+own.
 """
 
 from __future__ import annotations

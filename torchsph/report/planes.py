@@ -181,9 +181,7 @@ def _outline(surface: geometry.Surface, plane: Plane) -> tuple[np.ndarray, np.nd
         segments, faces = surface.vertices[surface.faces], np.arange(len(surface.faces))
     else:
         normal = np.cross(plane.across, plane.along)
-        segments, faces = trimesh.intersections.mesh_plane(
-            surface.trimesh(), normal, plane.origin, return_faces=True
-        )
+        segments, faces = trimesh.intersections.mesh_plane(surface.trimesh(), normal, plane.origin, return_faces=True)
     relative = np.asarray(segments).reshape(-1, 2, len(plane.origin)) - plane.origin
     ends = np.stack([relative @ plane.across, relative @ plane.along], axis=-1).reshape(-1, 4)
     return ends, np.asarray(surface.region)[np.asarray(faces, int)]

@@ -55,7 +55,7 @@ const FONT = '12px system-ui, "Segoe UI", Roboto, "DejaVu Sans", Arial, sans-ser
 /** The colour scale above the planes. */
 function drawScale(canvas, channel) {
   const [context, width] = fitted(canvas);
-  const { label, unit, signed, colours: name } = CHANNELS[channel];
+  const { label, long, unit, signed, colours: name } = CHANNELS[channel];
   const top = topOf(channel);
   const table = colours(name);
   const left = 2;
@@ -69,7 +69,7 @@ function drawScale(canvas, channel) {
   context.strokeRect(left, 16, wide, 12);
   context.font = FONT;
   context.fillStyle = "#1a1f26";
-  context.fillText(`${label}, ${unit}`, left, 11);
+  context.fillText(`${long || label}, ${unit}`, left, 11);
   const ticks = signed ? [-top, -top / 2, 0, top / 2, top] : [0, top / 4, top / 2, (3 * top) / 4, top];
   ticks.forEach((value, n) => {
     context.textAlign = n === 0 ? "left" : n === 4 ? "right" : "center";

@@ -30,9 +30,9 @@ function frameOf(packed, frame) {
 
 const CHANNELS = {
   speed: { label: "Speed", unit: "m/s", colours: "viridis", signed: false },
-  vorticity: { label: "Vorticity (about the line of sight)", short: "Vorticity", unit: "1/s", colours: "balance", signed: true },
-  pressure: { label: "Pressure (relative)", short: "Pressure", unit: "Pa", colours: "balance", signed: true },
-  deviation: { label: "Deviation (of the velocity)", short: "Deviation", unit: "m/s", colours: "amber", signed: false },
+  vorticity: { label: "Vorticity", long: "Vorticity about the line of sight, counter-clockwise positive", unit: "1/s", colours: "balance", signed: true },
+  pressure: { label: "Pressure", long: "Pressure, relative", unit: "Pa", colours: "balance", signed: true },
+  deviation: { label: "Deviation", long: "Standard deviation of the velocity", unit: "m/s", colours: "amber", signed: false },
 };
 
 /** Whether a flow has a channel in its planes. */

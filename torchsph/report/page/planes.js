@@ -228,7 +228,7 @@ class PlaneView {
     const range = largest >= least ? `${shown(least)} to ${shown(largest)} ${unit}` : "nothing known";
     this.canvas.setAttribute("aria-label", `${this.plane.name}, ${what.source}: ${label}, ${range}`);
     if (!this.probe) {
-      this.reading.textContent = `${CHANNELS[what.channel].short || label}: ${range}`;
+      this.reading.textContent = `${label}: ${range}`;
       return;
     }
     const n = this.nearest(...this.probe);
@@ -237,7 +237,7 @@ class PlaneView {
       return;
     }
     const velocity = [0, 1, 2].slice(0, this.velocity.length / size).map((k) => shown(this.velocity[k * size + n]));
-    const first = what.channel === "speed" ? "Speed" : CHANNELS[what.channel].short || label;
+    const first = what.channel === "speed" ? "Speed" : label;
     this.reading.textContent = `${first} ${shown(this.values[n])} ${unit}; velocity right, up${velocity[2] ? ", towards you" : ""}: ${velocity.join(", ")} m/s`;
   }
 
