@@ -13,6 +13,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from .methods.between_frames import BetweenFrames
     from .methods.by_name import DEFAULT_METHOD, METHODS, MethodResult, forecast_skill, make_model, run_methods
     from .methods.ensemble.assimilate import EnsembleRun, assimilate, default_filter
     from .methods.ensemble.options import EnsembleOptions, Estimated
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     from .methods.measurement.frame_splines import smooth
     from .methods.measurement.prepared import PreparedMeasurement as PreparedMeasurement
     from .methods.nudging import FilteredRun, filter_sph
+    from .methods.resample import resample
     from .pairs.smoothing_kernels import KERNELS, SmoothingKernel, kernel
     from .report.write import write_report
     from .simulator.failures import NumericalFailure
@@ -46,6 +48,7 @@ __all__ = [
     "METHODS",
     "PRESETS",
     "XSPH",
+    "BetweenFrames",
     "CompleteKernelWall",
     "EnsembleOptions",
     "EnsembleRun",
@@ -82,6 +85,7 @@ __all__ = [
     "kernel",
     "make_model",
     "preset",
+    "resample",
     "residual_motion",
     "run_methods",
     "skill",
@@ -91,6 +95,7 @@ __all__ = [
 
 # where each public name lives, as the imports above have it
 _HOMES = {
+    "methods.between_frames": ("BetweenFrames",),
     "methods.by_name": (
         "DEFAULT_METHOD",
         "METHODS",
@@ -122,6 +127,7 @@ _HOMES = {
         "FilteredRun",
         "filter_sph",
     ),
+    "methods.resample": ("resample",),
     "pairs.smoothing_kernels": (
         "KERNELS",
         "SmoothingKernel",
