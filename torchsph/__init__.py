@@ -13,6 +13,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from .methods.between_frames import BetweenFrames
     from .methods.by_name import DEFAULT_METHOD, METHODS, MethodResult, forecast_skill, make_model, run_methods
     from .methods.ensemble.assimilate import EnsembleRun, assimilate, default_filter
     from .methods.ensemble.options import EnsembleOptions, Estimated
@@ -21,7 +22,9 @@ if TYPE_CHECKING:
     from .methods.measurement.frame_splines import smooth
     from .methods.measurement.prepared import PreparedMeasurement as PreparedMeasurement
     from .methods.nudging import FilteredRun, filter_sph
+    from .methods.resample import resample
     from .pairs.smoothing_kernels import KERNELS, SmoothingKernel, kernel
+    from .report.write import write_report
     from .simulator.failures import NumericalFailure
     from .simulator.grid_forecast import GridForecast, Transfer
     from .simulator.residual_motion import ResidualMotion, residual_motion
@@ -46,6 +49,7 @@ __all__ = [
     "METHODS",
     "PRESETS",
     "XSPH",
+    "BetweenFrames",
     "CompleteKernelWall",
     "EnsembleOptions",
     "EnsembleRun",
@@ -83,14 +87,17 @@ __all__ = [
     "kernel",
     "make_model",
     "preset",
+    "resample",
     "residual_motion",
     "run_methods",
     "skill",
     "smooth",
+    "write_report",
 ]
 
 # where each public name lives, as the imports above have it
 _HOMES = {
+    "methods.between_frames": ("BetweenFrames",),
     "methods.by_name": (
         "DEFAULT_METHOD",
         "METHODS",
@@ -122,11 +129,13 @@ _HOMES = {
         "FilteredRun",
         "filter_sph",
     ),
+    "methods.resample": ("resample",),
     "pairs.smoothing_kernels": (
         "KERNELS",
         "SmoothingKernel",
         "kernel",
     ),
+    "report.write": ("write_report",),
     "simulator.failures": ("NumericalFailure",),
     "simulator.grid_forecast": (
         "GridForecast",
@@ -176,6 +185,7 @@ _ROOMS = (
     "methods",
     "native",
     "pairs",
+    "report",
     "simulator",
     "ultrasound",
     "validation",

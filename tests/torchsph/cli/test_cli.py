@@ -109,6 +109,7 @@ def test_assimilate_writes_what_it_promises(assimilated, files):
     assert {path.name for path in folder.iterdir()} == analyses | views | {
         "analysis.h5",
         "report.png",
+        "report.html",
         "filter.png",
         "metrics.json",
         "config.toml",

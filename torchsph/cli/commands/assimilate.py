@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 import shutil
 from collections.abc import Mapping
 from contextlib import nullcontext
@@ -17,6 +18,7 @@ from torchsph.evaluation import figures, metrics
 from torchsph.evaluation.scores import Scores
 from torchsph.methods import by_name
 from torchsph.methods.runtime import checkpoint, parallel
+from torchsph.report import write_report
 
 from ..arguments import add_model_options, add_output_folder, add_seed, add_sidecar, names, whole
 from ..checks import check_spacing, informative, usable_device
@@ -58,6 +60,7 @@ def add_method_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--minimum-members", type=whole(1), metavar="N", help="end the run where fewer live through a forecast (1)"
     )
+    parser.add_argument("--no-page", action="store_true", help="leave out report.html")
     add_seed(parser)
     add_sidecar(parser)
 
@@ -69,7 +72,8 @@ def assimilate(args: argparse.Namespace) -> None:
     """
     measured_path, truth_path, methods = _inputs(args)
     files = [f"{name}{end}" for name in (*methods, "analysis") for end in (".h5", ".vtkhdf", "_wall.vtkhdf")]
-    folder = output_folder(args.out, [*files, "report.png", "filter.png", "metrics.json", "config.toml"])
+    files += ["report.png", "report.html", "filter.png", "metrics.json", "config.toml"]
+    folder = output_folder(args.out, files)
     device = parallel.own_device(usable_device(args.device))
     lead = parallel.is_lead()
     held = locked(folder) if lead else nullcontext(folder)
@@ -161,12 +165,51 @@ def _write(
             filter_figure(results["ensemble"].info["filter"]).savefig(scratch / "filter.png", dpi=110)
         write_config(scratch, args)
         write_json(scratch / "metrics.json", metrics_document(measured, scores, seconds, config))
+        if not args.no_page:
+            _write_page(scratch, measured, truth, results, scores, config)
     print_table(figures.scores_table(scores, seconds))
     for words in results["ensemble"].info["filter"]["warnings"] if "ensemble" in results else ():
         say(f"ensemble: {words}")
     files = ", ".join(f"{name}.h5" for name in analyses)
-    say(f"wrote {files}, analysis.h5 (= {config['analysis']}.h5), report.png and metrics.json to {folder}/")
+    page = "" if args.no_page else "report.html, "
+    say(f"wrote {files}, analysis.h5 (= {config['analysis']}.h5), {page}report.png and metrics.json to {folder}/")
     say(figures.NOT_CLINICAL)
+
+
+def _write_page(
+    scratch: Path,
+    measured: geometry.Recording,
+    truth: geometry.Recording | None,
+    results: Mapping[str, by_name.MethodResult],
+    scores: Mapping[str, Scores],
+    config: Mapping[str, Any],
+) -> None:
+    """Write `report.html` of the analysis, with the quantities where they were written before.
+
+    Args:
+        scratch: folder of the results.
+        measured: the measurement.
+        truth: the true flow, or None.
+        results: of each method.
+        scores: of each method, and of the measurement as `raw`.
+        config: what was asked for.
+    """
+    chosen, quantities = config["analysis"], scratch / "quantities.json"
+    mended = [result.info["estimates"] for result in results.values() if "estimates" in result.info]
+    write_report(
+        scratch / "report.html",
+        results[chosen].recording,
+        measured,
+        truth=truth,
+        name=chosen,
+        title=f"Flow of {Path(config['measured']).name}",
+        scores=scores,
+        seconds={name: result.seconds for name, result in results.items()},
+        quantities=json.loads(quantities.read_text(encoding="utf-8")) if quantities.exists() else None,
+        estimates=mended[0] if mended else None,
+        account=config["info"]["provenance"],
+        notes=results["ensemble"].info["filter"]["warnings"] if "ensemble" in results else (),
+    )
 
 
 def _inputs(args: argparse.Namespace) -> tuple[Path, Path | None, tuple[str, ...]]:

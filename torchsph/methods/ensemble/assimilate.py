@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from tqdm import tqdm
 
 import geometry
@@ -24,6 +25,7 @@ from torchsph.assimilation import LETKF, RTPS, Filter, Localisation
 from torchsph.simulator.simulator import Simulator
 from torchsph.simulator.transfer.checks import check_grid
 
+from ..between_frames import BetweenFrames, FlowAt
 from ..measurement.observation_operator import Measurement
 from ..measurement.prepared import PreparedMeasurement
 from ..runtime import checkpoint
@@ -39,10 +41,21 @@ from .options import EnsembleOptions
 
 @dataclass(frozen=True)
 class EnsembleRun:
-    """The analyses of a recording, with the standard deviation the filter claims, and the accounts."""
+    """The analyses of a recording, with the standard deviation the filter claims, and the accounts.
+
+    Attributes:
+        recording: the analyses.
+        info: the accounts.
+        model: simulator of the control, which `at` asks what lies between the frames.
+    """
 
     recording: geometry.Recording
     info: dict[str, Any] = field(default_factory=dict)
+    model: Simulator | None = None
+
+    def at(self, times: ArrayLike, points: ArrayLike) -> FlowAt:
+        """Velocity and deviation at any times (s) and points (n, D), m, between the frames as the model has it."""
+        return BetweenFrames(self.recording, self.model).at(times, points)
 
 
 def default_filter(measured: geometry.Recording, options: EnsembleOptions) -> LETKF:
@@ -128,7 +141,7 @@ def assimilate(
     if state is not None:
         cycle.restore(state)
     _run(cycle, path, key, progress, watcher)
-    return EnsembleRun(cycle.analyses.recording(f"ensemble of {members} SPH simulations"), accounts_of(cycle))
+    return EnsembleRun(cycle.analyses.recording(f"ensemble of {members} SPH simulations"), accounts_of(cycle), model)
 
 
 def _run(cycle: Cycle, path: Path | None, key: str, progress: bool, watcher: Watcher | None) -> None:
