@@ -227,19 +227,16 @@ class Recording:
         sigma: np.ndarray | None = None,
         uncovered: np.ndarray | None = None,
         quality: np.ndarray | None = None,
-        pressure: np.ndarray | None = None,
-        pressure_sigma: np.ndarray | None = None,
         description: str | None = None,
     ) -> Recording:
         """Another velocity (T, D, *shape), m/s, between the same walls: an analysis or a forecast.
 
-        What belonged to the old velocity (weight, sigma, quality, beam, pressure, fluxes) is dropped; what belongs to
-        the new one may be given.
+        What belonged to the old velocity (weight, sigma, quality, beam, pressure, fluxes) is dropped.
         """
-        gone: dict[str, Any] = dict.fromkeys(("weight", "beam", "flux_mitral", "flux_aortic"))
+        gone: dict[str, Any] = dict.fromkeys(("weight", "beam", "pressure", "pressure_sigma"))
+        gone |= dict.fromkeys(("flux_mitral", "flux_aortic"))
         text = self.description if description is None else description
         new: dict[str, Any] = {"velocity": velocity, "sigma": sigma, "uncovered": uncovered, "quality": quality}
-        new |= {"pressure": pressure, "pressure_sigma": pressure_sigma}
         return replace(self, **new, description=text, fluxes=(), **gone)
 
     def valve_intervals_or_derived(self) -> np.ndarray:

@@ -25,7 +25,7 @@ from .measurement.prepared import PreparedMeasurement
 from .members.draws import spline_frames
 from .members.frames import FrameObserver
 from .members.kept import MemberFile
-from .members.quantities import MemberCurves, MemberQuantities, quantified
+from .members.quantities import MemberCurves, MemberQuantities, quantified, with_pressure
 from .memory import MemoryPrediction, free_memory, predicted
 from .nudging import filter_sph
 from .runtime import checkpoint
@@ -155,7 +155,9 @@ def run_methods(
         curves = None
         if "spline" in quantities and is_lead():
             curves = quantified(smoothed, spline_frames(prepared.splines, smoothed, count, seed=seed))
-        results["spline"] = timer.result(smoothed, {"smoother": repr(smoother), **mended}, curves)
+        results["spline"] = timer.result(
+            with_pressure(smoothed, curves), {"smoother": repr(smoother), **mended}, curves
+        )
     if is_last() and set(methods) != {"spline"}:
         free = run_freely(measured, models.coarse, smoothed.velocity[0], seed=seed, progress=progress)
         results["free"] = timer.result(free)
@@ -164,7 +166,7 @@ def run_methods(
         results["sph"] = timer.result(run.recording, run.info)
     if ensemble is not None:
         done, curves = ensemble.run(watcher, progress)
-        results["ensemble"] = timer.result(done.recording, done.info | mended, curves)
+        results["ensemble"] = timer.result(with_pressure(done.recording, curves), done.info | mended, curves)
     return _collected(results)
 
 

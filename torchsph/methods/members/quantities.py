@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -18,7 +18,7 @@ from torchsph.haemodynamics.uncertainty import Summary, summary
 
 from .frames import MemberFrame
 
-__all__ = ["MemberCurves", "MemberQuantities", "quantified"]
+__all__ = ["MemberCurves", "MemberQuantities", "quantified", "with_pressure"]
 
 Array = NDArray[np.float64]
 
@@ -127,6 +127,13 @@ class MemberQuantities:
         upper = of_frame.base - probe * of_frame.axis
         at_base = region_mean(pressure, of_frame.mask, self.domain.grid, upper, probe)
         return np.where(of_frame.mask, pressure - at_base, 0.0).astype(np.float32)
+
+
+def with_pressure(recording: geometry.Recording, curves: MemberCurves | None) -> geometry.Recording:
+    """A recording with the pressure and its deviation that have been read out of it; without any, as it is."""
+    if curves is None:
+        return recording
+    return replace(recording, pressure=curves.pressure, pressure_sigma=curves.pressure_sigma)
 
 
 def quantified(recording: geometry.Recording, frames: Iterable[MemberFrame]) -> MemberCurves:
