@@ -231,9 +231,12 @@ class FrameQuantities:
     def _open_orifices(self, wall: geometry.WallPoints) -> dict[str, tuple[float, OpeningFlow]]:
         """Inlet and outlet where they are open, and the sign of their valve's own direction."""
         domain, found = self.domain, {}
+        there = [int(label) for label in np.unique(wall.region[wall.region > 0])]
+        passing = [label for label in there if domain.is_open(label, self.time)]
         for name, region, sign in (("flow_inlet", domain.inlet, 1.0), ("flow_outlet", domain.outlet, -1.0)):
-            if domain.is_open(region, self.time) and bool((wall.region == region).any()):
-                found[name] = (sign, OpeningFlow(domain.grid, self.mask, wall, region))
+            if region in passing:
+                others = [label for label in passing if label != region]
+                found[name] = (sign, OpeningFlow(domain.grid, self.mask, wall, region, others))
         return found
 
 
