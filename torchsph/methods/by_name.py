@@ -148,16 +148,11 @@ def run_methods(
         )
         ensemble.refuse_foreign_checkpoint()
     smoothed = prepared.smoothed  # by all processes together
-    found = prepared.splines.estimates.summary()
-    mended = {"estimates": found} if found else {}
+    mended = {"estimates": found} if (found := prepared.splines.estimates.summary()) else {}
     results: dict[str, MethodResult] = {}
     if "spline" in methods:
-        curves = None
-        if "spline" in quantities and is_lead():
-            curves = quantified(smoothed, spline_frames(prepared.splines, smoothed, count, seed=seed))
-        results["spline"] = timer.result(
-            with_pressure(smoothed, curves), {"smoother": repr(smoother), **mended}, curves
-        )
+        drawn = _drawn(prepared, count, seed) if "spline" in quantities and is_lead() else None
+        results["spline"] = timer.result(with_pressure(smoothed, drawn), {"smoother": repr(smoother)} | mended, drawn)
     if is_last() and set(methods) != {"spline"}:
         free = run_freely(measured, models.coarse, smoothed.velocity[0], seed=seed, progress=progress)
         results["free"] = timer.result(free)
@@ -288,6 +283,12 @@ def _check(methods: Sequence[str], measured: geometry.Recording) -> None:
         raise ValueError(f"unknown method {', '.join(unknown)}; known: {', '.join(METHODS)}")
     if "sph" in methods:
         geometry.measurement_type(measured).require_full("method sph imposes")
+
+
+def _drawn(prepared: PreparedMeasurement, count: int, seed: int) -> MemberCurves:
+    """What draws from the splines' posterior give."""
+    frames = spline_frames(prepared.splines, prepared.smoothed, count, seed=seed)
+    return quantified(prepared.smoothed, frames)
 
 
 def _collected(results: dict[str, MethodResult]) -> dict[str, MethodResult]:

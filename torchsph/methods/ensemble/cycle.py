@@ -104,7 +104,7 @@ class Cycle:
         """The next frame's analysis (``Analyses.add``), and its members to those who look on."""
         self.analyses.add(self.ensemble, control, sigma, quality, missing)
         if self.member_frames is not None:
-            self.member_frames.analysed(self.done - 1, self.analyses.fields[-1], self.ensemble)
+            self.member_frames.analysed(self.done - 1, self.analyses.fields[-1], self.ensemble.members)
             if self.done == self.measured.frames:
                 self.member_frames.finish()
 
@@ -134,8 +134,9 @@ class Cycle:
         forecasts = self.forecaster.advance(self.ensemble, before, early, times, masks)
         self._count_alive(forecasts.failed, now)
         self.analyses.shocks.append(forecasts.shock)
-        if self.member_frames is not None:
-            self.member_frames.forecast(forecasts)
+        if self.member_frames is not None and forecasts.rates is not None and forecasts.pressure is not None:
+            rates = forecasts.rates
+            self.member_frames.forecast(rates.control, rates.members, forecasts.failed, forecasts.pressure)
         states = self.forecast_spread.prepared(forecasts, from_last(noise), frame, self.analyser.spread_match.factor)
         missing = int((late & ~forecasts.covered).sum())
         parts = [Part(measurement, what, _nearest(times, time)) for measurement, what, time in seen]

@@ -22,7 +22,6 @@ from torch import Tensor
 
 import geometry
 
-from ..ensemble.forecaster import Ensemble, Forecasts
 from ..runtime.parallel import is_lead
 
 __all__ = ["FrameObserver", "MemberFrame", "MemberFrames", "at_frame"]
@@ -81,19 +80,29 @@ class MemberFrames:
         self._pending: dict[str, Tensor] | None = None
         self._frame = -1
 
-    def analysed(self, frame: int, field: Tensor, ensemble: Ensemble) -> None:
-        """The analysis of a frame: the estimate as it is given out, and the ensemble that goes on from it."""
-        mask = torch.from_numpy(np.array(self.recording.mask[frame], bool))
-        anomalies = ensemble.members - ensemble.members.mean(0)
-        members = torch.where(mask, field + anomalies, 0.0).to(torch.float32)
-        self._frame, self._pending = frame, {"field": field, "members": members}
+    def analysed(self, frame: int, field: Tensor, members: Tensor) -> None:
+        """The analysis of a frame.
 
-    def forecast(self, forecasts: Forecasts) -> None:
-        """The forecast from the last frame analysed, which can be handed on now."""
-        if forecasts.rates is None or forecasts.pressure is None:
-            raise ValueError("MemberFrames needs forecasts with motion (Forecaster(motion=True))")
-        rates = self._of_all(forecasts.rates, forecasts.failed)
-        ends = [{**rates, "pressure": half - half.nanmean()} for half in forecasts.pressure]
+        Args:
+            frame: its number.
+            field: (D, *shape), m/s, the estimate as it is given out.
+            members: (N, D, *shape), m/s, of the ensemble that goes on from it; their mean need not be the estimate.
+        """
+        mask = torch.from_numpy(np.array(self.recording.mask[frame], bool))
+        around = torch.where(mask, field + members - members.mean(0), 0.0).to(torch.float32)
+        self._frame, self._pending = frame, {"field": field, "members": around}
+
+    def forecast(self, rate: Tensor, member_rates: Tensor, failed: Tensor, pressure: Tensor) -> None:
+        """The forecast from the last frame analysed, which can be handed on now.
+
+        Args:
+            rate: (D, *shape), m/s^2, mean du/dt of the estimate over the interval, NaN where unknown.
+            member_rates: (N, D, *shape), m/s^2, of the members.
+            failed: (N,) bool, members that count for nothing here.
+            pressure: (2, *shape), Pa, averages over both halves of the interval, up to a constant each.
+        """
+        rates = self._of_all(rate, member_rates, failed)
+        ends = [{**rates, "pressure": half - half.nanmean()} for half in pressure]
         self._hand_on(ends[0])
         self._before = ends[1]
 
@@ -117,12 +126,12 @@ class MemberFrames:
             observer.restore(kept)
 
     @staticmethod
-    def _of_all(rates: Ensemble, failed: Tensor) -> dict[str, Tensor]:
+    def _of_all(rate: Tensor, member_rates: Tensor, failed: Tensor) -> dict[str, Tensor]:
         """Rates of the estimate and of every member; one that has failed takes the mean of the others."""
-        mean = rates.members[~failed].mean(0) if bool((~failed).any()) else rates.control
-        members = torch.where(failed.reshape(-1, *[1] * mean.ndim), mean, rates.members)
-        lost = not bool(torch.isfinite(rates.control).any())
-        return {"rate": mean if lost else rates.control, "member_rates": members}
+        mean = member_rates[~failed].mean(0) if bool((~failed).any()) else rate
+        members = torch.where(failed.reshape(-1, *[1] * mean.ndim), mean, member_rates)
+        lost = not bool(torch.isfinite(rate).any())
+        return {"rate": mean if lost else rate, "member_rates": members}
 
     def _hand_on(self, after: dict[str, Tensor] | None) -> None:
         frame, pending, before = self._frame, self._pending, self._before

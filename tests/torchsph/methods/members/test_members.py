@@ -13,7 +13,6 @@ import geometry
 from torchsph import EnsembleOptions, PreparedMeasurement, Simulator, assimilate, preset
 from torchsph.data import sample_measurement
 from torchsph.haemodynamics import UNITS, FlowDomain, flow_quantities
-from torchsph.methods.ensemble.forecaster import Ensemble, Forecasts
 from torchsph.methods.members.draws import spline_frames
 from torchsph.methods.members.frames import MemberFrames
 from torchsph.methods.members.kept import MemberFile, most_bytes, read_members, rounded
@@ -172,12 +171,6 @@ def test_a_full_disk_is_told_before_the_run(given, monkeypatch, tmp_path):
         MemberFile(tmp_path / "members.h5", given.measured, MEMBERS)
 
 
-def forecasts(control, members, failed, pressure):
-    rates = Ensemble(control, members)
-    covered = torch.ones(control.shape[1:], dtype=torch.bool)
-    return Forecasts([], covered, failed, False, 1, 0.0, rates, pressure)
-
-
 def test_rates_at_a_frame_from_both_sides_of_it(given):
     recording = replace(given.measured, valve_intervals=np.array([[2.0, -np.inf, given.measured.time[2] + 1e-3]]))
     kept, shape = Kept(), given.measured.velocity.shape[1:]
@@ -185,7 +178,7 @@ def test_rates_at_a_frame_from_both_sides_of_it(given):
     field = torch.zeros(shape)
     failed = torch.tensor([False, True, False])
     for frame in range(4):
-        frames.analysed(frame, field, Ensemble(field, torch.zeros(MEMBERS, *shape)))
+        frames.analysed(frame, field, torch.zeros(MEMBERS, *shape))
         if frame == 3:
             frames.finish()
             break
@@ -193,7 +186,7 @@ def test_rates_at_a_frame_from_both_sides_of_it(given):
         rate = torch.full(shape, 10.0 * (frame + 1))
         rate[:, 0] = torch.nan if frame == 0 else 7.0
         pressure = torch.arange(float(np.prod(shape[1:]))).reshape(shape[1:]).repeat(2, 1, 1, 1) + 100.0 * frame
-        frames.forecast(forecasts(rate, members, failed, pressure))
+        frames.forecast(rate, members, failed, pressure)
     levels = [float(frame.rate[0, 1, 0, 0]) for frame in kept.frames]
     assert levels == [10.0, 15.0, 20.0, 30.0]  # ends: one side; frame 2: a valve shuts behind it
     assert [float(frame.rate[0, 0, 0, 0]) for frame in kept.frames] == [0.0, 7.0, 7.0, 7.0]
