@@ -25,6 +25,7 @@ from ..checks import check_spacing, informative, usable_device
 from ..command import Command
 from ..outputs import output_folder, staged, write_json
 from ..printing import print_table, run_config, say
+from ..quantity_tables import CAUTION, QuantityTables, methods_read_out
 from ..running.folder_lock import locked
 from ..running.notes import shows_bar
 from ..running.provenance import provenance
@@ -63,6 +64,13 @@ def add_method_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--no-page", action="store_true", help="leave out report.html")
     add_seed(parser)
     add_sidecar(parser)
+    parser.add_argument(
+        "--quantities",
+        action="store_true",
+        help="energy, pressure, flow rates ... without an ensemble too: of splines with draws from their posterior",
+    )
+    parser.add_argument("--no-quantities", action="store_true", help="leave out quantities.json, quantities.csv")
+    parser.add_argument("--keep-members", action="store_true", help="write the ensemble's members to DIR/members.h5")
 
 
 def assimilate(args: argparse.Namespace) -> None:
@@ -72,6 +80,7 @@ def assimilate(args: argparse.Namespace) -> None:
     """
     measured_path, truth_path, methods = _inputs(args)
     files = [f"{name}{end}" for name in (*methods, "analysis") for end in (".h5", ".vtkhdf", "_wall.vtkhdf")]
+    files += ["members.h5", "quantities.json", "quantities.csv"]
     files += ["report.png", "report.html", "filter.png", "metrics.json", "config.toml"]
     folder = output_folder(args.out, files)
     device = parallel.own_device(usable_device(args.device))
@@ -83,6 +92,7 @@ def assimilate(args: argparse.Namespace) -> None:
         also = [informative(geometry.read_recording(path), path) for path in args.also]
         truth = None if truth_path is None else geometry.read_recording(truth_path)
         check_spacing(args.spacing, measured)
+        read_out = methods_read_out(args, methods, measured)
         raw = metrics.evaluate(measured, truth, measured)  # first: a truth that does not fit must not cost a run
         saved, resume = folder / "checkpoint.pt", args.resume
         if "ensemble" in methods and lead:
@@ -104,6 +114,8 @@ def assimilate(args: argparse.Namespace) -> None:
                 seed=args.seed,
                 device=device,
                 progress=lead and shows_bar(args),
+                quantities=read_out,
+                keep_members=folder / "members.h5" if args.keep_members else None,
             )
         if not lead:
             return
@@ -154,6 +166,9 @@ def _write(
     if truth is not None:
         claims = {name: metrics.spread_over_skill(recording, truth) for name, recording in analyses.items()}
         config["spread_over_skill"] = {name: claim.value for name, claim in claims.items() if claim is not None}
+    tables = None
+    if args.quantities or results[config["analysis"]].quantities is not None:
+        tables = QuantityTables.of(analyses[config["analysis"]], results[config["analysis"]].quantities, truth)
     with staged(folder) as scratch:
         for name, recording in analyses.items():
             geometry.write_recording(scratch / f"{name}.h5", recording, provenance=account | {"method": name})
@@ -165,9 +180,14 @@ def _write(
             filter_figure(results["ensemble"].info["filter"]).savefig(scratch / "filter.png", dpi=110)
         write_config(scratch, args)
         write_json(scratch / "metrics.json", metrics_document(measured, scores, seconds, config))
+        if tables is not None:
+            tables.write(scratch, {key: value for key, value in config.items() if key != "info"})
         if not args.no_page:
             _write_page(scratch, measured, truth, results, scores, config)
     print_table(figures.scores_table(scores, seconds))
+    if tables is not None:
+        print_table(tables.table())
+        say(CAUTION)
     for words in results["ensemble"].info["filter"]["warnings"] if "ensemble" in results else ():
         say(f"ensemble: {words}")
     files = ", ".join(f"{name}.h5" for name in analyses)

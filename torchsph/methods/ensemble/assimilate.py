@@ -28,6 +28,7 @@ from torchsph.simulator.transfer.checks import check_grid
 from ..between_frames import BetweenFrames, FlowAt
 from ..measurement.observation_operator import Measurement
 from ..measurement.prepared import PreparedMeasurement
+from ..members.frames import FrameObserver
 from ..runtime import checkpoint
 from ..runtime.checkpoint import Saved
 from ..runtime.parallel import anywhere
@@ -80,6 +81,7 @@ def assimilate(
     watcher: Watcher | None = None,
     seed: int = 0,
     progress: bool = False,
+    observers: Sequence[FrameObserver] = (),
 ) -> EnsembleRun:
     """Assimilate measurements into an ensemble of SPH simulations, as this module's docstring says.
 
@@ -98,6 +100,8 @@ def assimilate(
         seed: of everything random. Under ``torch.distributed`` the processes share the simulations; the result is the
             same for any number of them.
         progress: show a bar.
+        observers: what is done with every frame, its members and accelerations, as the first process has them; not
+            with a lag, which changes analyses after their time.
 
     Returns:
         The analyses, with their claimed deviation and the accounts of the run.
@@ -113,6 +117,10 @@ def assimilate(
     if resume and checkpoints is None:
         raise ValueError("resume needs the file of checkpoints that the run before wrote")
     options = EnsembleOptions() if options is None else options
+    if observers and options.lag is not None:
+        raise ValueError(
+            "members are followed without a lag alone: later data change the analyses that they lie around"
+        )
     coarse = model if coarse is None else coarse
     given = measured if isinstance(measured, geometry.Recording) else measured.recording
     for one in (model, coarse):
@@ -130,12 +138,13 @@ def assimilate(
         saved.refuse_foreign(key)  # before the splines and error models that the cycle begins with
     cycle = Cycle(
         [Measurement(each, grid, options.kernel) for each in prepared],
-        Forecaster(model, coarse, grid, options.transfer, batch=options.batch, seed=seed),
+        Forecaster(model, coarse, grid, options.transfer, batch=options.batch, seed=seed, motion=bool(observers)),
         filter,
         options,
         members=members,
         truth=truth,
         seed=seed,
+        observers=observers,
     )
     state = checkpoint.shared_state(saved, key) if resume else None
     if state is not None:

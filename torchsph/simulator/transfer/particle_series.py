@@ -90,8 +90,8 @@ class ParticleSeries:
             self._write(self._run.time)
         self._series.__exit__(kind, fault, trace)
 
-    def _observe(self, stepped: Tensor, time: Tensor) -> None:
-        if not bool(stepped[self._member]):
+    def _observe(self, time: Tensor, length: Tensor) -> None:
+        if not float(length[self._member]) > 0:
             return
         self._steps += 1
         if self._steps % self._every == 0:
