@@ -31,6 +31,7 @@ LAYOUT: tuple[tuple[str, str, type], ...] = (
     ("quality", "/quality", np.uint8),
     ("beam", "/beam", np.float32),
     ("pressure", "/pressure", np.float32),
+    ("pressure_sigma", "/pressure_sigma", np.float32),
     ("wall.vertices", "/wall/vertices", np.float64),
     ("wall.faces", "/wall/faces", np.int32),
     ("wall.region", "/wall/region", np.uint8),
@@ -109,6 +110,7 @@ class Recording:
         quality: (T, *shape), codes of `Quality`: why an analysis is what it is at each node.
         beam: (T, D, *shape) or (D, *shape), unit vectors along which alone the velocity was measured.
         pressure: (T, *shape), Pa, gauge.
+        pressure_sigma: (T, *shape), Pa, standard deviation of the pressure.
         valve_intervals: (n, 3), rows (region, opens, closes), s.
         valve_leak: (n, 2), rows (region, part of its area that stays open while it is shut).
         valve_open: (T, 2), regions 1 and 2 open at the frames; used where there are no intervals.
@@ -136,6 +138,7 @@ class Recording:
     quality: np.ndarray | None = None
     beam: np.ndarray | None = None
     pressure: np.ndarray | None = None
+    pressure_sigma: np.ndarray | None = None
     valve_intervals: np.ndarray | None = None
     valve_leak: np.ndarray | None = None
     valve_open: np.ndarray | None = None
@@ -233,7 +236,8 @@ class Recording:
 
         What belonged to the old velocity (weight, sigma, quality, beam, pressure, fluxes) is dropped.
         """
-        gone: dict[str, Any] = dict.fromkeys(("weight", "beam", "pressure", "flux_mitral", "flux_aortic"))
+        gone: dict[str, Any] = dict.fromkeys(("weight", "beam", "pressure", "pressure_sigma"))
+        gone |= dict.fromkeys(("flux_mitral", "flux_aortic"))
         text = self.description if description is None else description
         new: dict[str, Any] = {"velocity": velocity, "sigma": sigma, "uncovered": uncovered, "quality": quality}
         return replace(self, **new, description=text, fluxes=(), **gone)
@@ -310,6 +314,7 @@ def _allowed_shapes(recording: Recording) -> dict[str, tuple[tuple[int, ...], ..
         "/quality": ((frames, *shape),),
         "/beam": ((frames, dimension, *shape), (dimension, *shape)),
         "/pressure": ((frames, *shape),),
+        "/pressure_sigma": ((frames, *shape),),
         **({} if recording.wall is None else _allowed_wall_shapes(recording.wall, frames, dimension)),
         "/valve/intervals": ((len(intervals) if intervals is not None and intervals.ndim else 0, 3),),
         "/valve/leak": ((len(leak) if leak is not None and leak.ndim else 0, 2),),

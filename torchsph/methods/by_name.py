@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time as clock
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -21,6 +21,10 @@ from .ensemble.options import EnsembleOptions
 from .forecast_skill import ForecastSkill, skill
 from .free_run import run_freely
 from .measurement.prepared import PreparedMeasurement
+from .members.draws import spline_frames
+from .members.frames import FrameObserver
+from .members.kept import MemberFile
+from .members.quantities import MemberCurves, MemberQuantities, quantified, with_pressure
 from .memory import MemoryPrediction, free_memory, predicted
 from .nudging import filter_sph
 from .runtime.checkpoint import Saved
@@ -48,11 +52,12 @@ LONG_STEPS: dict[str, Any] = {"max_step": None, "longest_step": 0.7}
 
 @dataclass(frozen=True)
 class MethodResult:
-    """What one method made of a measurement."""
+    """What one method made of a measurement, and where they were asked for the quantities of all its members."""
 
     recording: geometry.Recording
     seconds: float
     info: dict[str, Any] = field(default_factory=dict)
+    quantities: MemberCurves | None = None
 
 
 def make_model(
@@ -99,6 +104,8 @@ def run_methods(
     seed: int = 0,
     device: str = "cpu",
     progress: bool = False,
+    quantities: Collection[str] = (),
+    keep_members: Path | None = None,
 ) -> dict[str, MethodResult]:
     """Run methods by name on one measurement, in the order of ``METHODS``.
 
@@ -106,7 +113,9 @@ def run_methods(
     defaults to ``ANALYSIS_SPACING`` grid spacings, half of it in the ensemble's control run; ``members`` to
     ``DEFAULT_MEMBERS``. ``also``, ``truth``, ``lag``, ``minimum_members``, ``checkpoints``, ``resume`` and ``watcher``
     are the ensemble's (``assimilate``, ``EnsembleOptions``); the other methods know one measurement. The seconds of a
-    method include the spline that it starts from only where "spline" itself was not asked for.
+    method include the spline that it starts from only where "spline" itself was not asked for. ``quantities`` names the
+    methods whose members are read out ("ensemble", and "spline" by as many draws as members); ``keep_members`` is the
+    file to which the ensemble's are written.
 
     Under torchrun all processes share the splines and the ensemble; the first one runs "sph" meanwhile and the last
     one "free". What the first one returns is complete.
@@ -137,14 +146,16 @@ def run_methods(
             checkpoints=None if checkpoints is None else Path(checkpoints),
             resume=resume,
             seed=seed,
+            quantities="ensemble" in quantities,
+            keep_members=keep_members,
         )
         ensemble.refuse_foreign_checkpoint()
     smoothed = prepared.smoothed  # by all processes together
-    found = prepared.splines.estimates.summary()
-    mended = {"estimates": found} if found else {}
+    mended = {"estimates": found} if (found := prepared.splines.estimates.summary()) else {}
     results: dict[str, MethodResult] = {}
     if "spline" in methods:
-        results["spline"] = timer.result(smoothed, {"smoother": repr(smoother), **mended})
+        drawn = _drawn(prepared, count, seed) if "spline" in quantities and is_lead() else None
+        results["spline"] = timer.result(with_pressure(smoothed, drawn), {"smoother": repr(smoother)} | mended, drawn)
     if is_last() and set(methods) != {"spline"}:
         free = run_freely(measured, models.coarse, smoothed.velocity[0], seed=seed, progress=progress)
         results["free"] = timer.result(free)
@@ -152,8 +163,8 @@ def run_methods(
         run = filter_sph(prepared, models.coarse, seed=seed, progress=progress)
         results["sph"] = timer.result(run.recording, run.info)
     if ensemble is not None:
-        done = ensemble.run(watcher, progress)
-        results["ensemble"] = timer.result(done.recording, done.info | mended)
+        done, curves = ensemble.run(watcher, progress)
+        results["ensemble"] = timer.result(with_pressure(done.recording, curves), done.info | mended, curves)
     return _collected(results)
 
 
@@ -232,6 +243,8 @@ class _EnsembleCall:
     checkpoints: Path | None
     resume: bool | Saved
     seed: int
+    quantities: bool = False
+    keep_members: Path | None = None
 
     def refuse_foreign_checkpoint(self) -> None:
         """Tell another run's checkpoint before splines and free runs have taken their minutes."""
@@ -249,9 +262,14 @@ class _EnsembleCall:
         )
         self.resume.refuse_foreign(key)
 
-    def run(self, watcher: Watcher | None, progress: bool) -> EnsembleRun:
-        """The ensemble's analyses."""
-        return assimilate(
+    def run(self, watcher: Watcher | None, progress: bool) -> tuple[EnsembleRun, MemberCurves | None]:
+        """The ensemble's analyses, and what its members give where it is asked for."""
+        read: list[FrameObserver] = []
+        if self.quantities:
+            read.append(MemberQuantities(self.prepared.recording))
+        if self.keep_members is not None:
+            read.append(MemberFile(self.keep_members, self.prepared.recording, self.members))
+        run = assimilate(
             self.prepared,
             self.models.fine,
             coarse=self.models.coarse,
@@ -264,7 +282,12 @@ class _EnsembleCall:
             watcher=watcher,
             seed=self.seed,
             progress=progress,
+            observers=read,
         )
+        if not self.quantities or not is_lead():
+            return run, None
+        curves = read[0].found() if isinstance(read[0], MemberQuantities) else None
+        return run, curves
 
 
 def _check(methods: Sequence[str], measured: geometry.Recording) -> None:
@@ -273,6 +296,12 @@ def _check(methods: Sequence[str], measured: geometry.Recording) -> None:
         raise ValueError(f"unknown method {', '.join(unknown)}; known: {', '.join(METHODS)}")
     if "sph" in methods:
         geometry.measurement_type(measured).require_full("method sph imposes")
+
+
+def _drawn(prepared: PreparedMeasurement, count: int, seed: int) -> MemberCurves:
+    """What draws from the splines' posterior give."""
+    frames = spline_frames(prepared.splines, prepared.smoothed, count, seed=seed)
+    return quantified(prepared.smoothed, frames)
 
 
 def _collected(results: dict[str, MethodResult]) -> dict[str, MethodResult]:
@@ -288,10 +317,15 @@ class _Timer:
     def __init__(self) -> None:
         self.began = clock.perf_counter()
 
-    def result(self, recording: geometry.Recording, info: dict[str, Any] | None = None) -> MethodResult:
+    def result(
+        self,
+        recording: geometry.Recording,
+        info: dict[str, Any] | None = None,
+        quantities: MemberCurves | None = None,
+    ) -> MethodResult:
         ended = clock.perf_counter()
         seconds, self.began = ended - self.began, ended
-        return MethodResult(recording, seconds, {} if info is None else info)
+        return MethodResult(recording, seconds, {} if info is None else info, quantities)
 
 
 def forecast_skill(

@@ -169,10 +169,17 @@ class Simulation(AdvancingRun):
     def fetch(self, grid: Grid, mask: Tensor) -> Fetched:
         """Velocities at the nodes where ``mask`` (*shape): value (members, D, *shape), covered (members, *shape).
 
+        A node a little beyond the walls has the velocity of the fluid before them.
+
         Raises:
             TypeError: a mask that is not bool.
             ValueError: another dimension or shape than the run's and the grid's.
         """
         check_grid(grid, self.domain.scene.dimension)
         check_mask(mask, grid)
-        return fetch_on_grid(self.particles, grid, mask, self.units, self._backend, self.domain.period)
+        nearest = None
+        if self.domain.walls is not None:
+            if not self.surroundings.entered:
+                self.surroundings.enter(self.time, self.time)
+            nearest = self.surroundings.nearest_fluid
+        return fetch_on_grid(self.particles, grid, mask, self.units, self._backend, self.domain.period, nearest)

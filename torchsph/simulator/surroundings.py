@@ -16,6 +16,7 @@ from .state.particles import Particles
 from .state.record import Record
 from .transfer.imposing import fill_beyond
 from .walls.compiled import near_wall
+from .walls.fields import STRAY
 from .walls.interface import WallSample
 from .walls.look_up import LookUp
 
@@ -40,6 +41,11 @@ class PresentSurroundings:
         self._bracket: tuple[float, float] = (0.0, 1.0)
         self._keys: tuple[Tensor, Tensor] | None = None
         self._fields: LookUp | None = None
+
+    @property
+    def entered(self) -> bool:
+        """Whether there are walls to look up: an interval was entered, and the scene has some."""
+        return self._fields is not None
 
     def enter(self, start: float, stop: float, *, shut: bool = False, valve_strength: float | Tensor = 1.0) -> None:
         """Choose key frames and open valves for an interval (s) without breaks inside.
@@ -89,6 +95,16 @@ class PresentSurroundings:
         passed = (self.clock.middle - early) / (late - early) if late > early else 0.0
         fraction = torch.full((), min(max(passed, 0.0), 1.0), dtype=self.domain.dtype, device=self.domain.device)
         return self._look_up(position, fraction)
+
+    def nearest_fluid(self, position: Tensor) -> Tensor:
+        """Points (n, D), internal, with those beyond the walls moved onto them, at the present time.
+
+        Only as far out as distances are exact: farther away nothing is known of the fluid anyway.
+        """
+        wall = self.sample_at(position)
+        out = (-wall.distance).clamp_min(0.0)
+        out = torch.where(out <= STRAY, out, torch.zeros_like(out))
+        return position + out[:, None] * wall.normal
 
     def _look_up(self, position: Tensor, fraction: Tensor) -> WallSample:
         """Walls at points (n, D), ``fraction`` () or (n,) of the way from the earlier fields to the later ones."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 import shutil
 from collections.abc import Mapping
 from contextlib import nullcontext
@@ -10,18 +11,21 @@ from pathlib import Path
 from typing import Any
 
 import geometry
+from geometry.formats import write_sidecar
 from torchsph import data
 from torchsph.assimilation import filter_figure
 from torchsph.evaluation import figures, metrics
 from torchsph.evaluation.scores import Scores
 from torchsph.methods import by_name
 from torchsph.methods.runtime import checkpoint, parallel
+from torchsph.report import write_report
 
-from ..arguments import add_model_options, add_output_folder, add_seed, names, whole
+from ..arguments import add_model_options, add_output_folder, add_seed, add_sidecar, names, whole
 from ..checks import check_spacing, informative, usable_device
 from ..command import Command
 from ..outputs import output_folder, staged, write_json
 from ..printing import print_table, run_config, say
+from ..quantity_tables import CAUTION, QuantityTables, methods_read_out
 from ..running.folder_lock import locked
 from ..running.notes import shows_bar
 from ..running.provenance import provenance
@@ -57,7 +61,16 @@ def add_method_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--minimum-members", type=whole(1), metavar="N", help="end the run where fewer live through a forecast (1)"
     )
+    parser.add_argument("--no-page", action="store_true", help="leave out report.html")
     add_seed(parser)
+    add_sidecar(parser)
+    parser.add_argument(
+        "--quantities",
+        action="store_true",
+        help="energy, pressure, flow rates ... without an ensemble too: of splines with draws from their posterior",
+    )
+    parser.add_argument("--no-quantities", action="store_true", help="leave out quantities.json, quantities.csv")
+    parser.add_argument("--keep-members", action="store_true", help="write the ensemble's members to DIR/members.h5")
 
 
 def assimilate(args: argparse.Namespace) -> None:
@@ -66,8 +79,10 @@ def assimilate(args: argparse.Namespace) -> None:
     Under torchrun the processes share the ensemble's simulations; the first one writes and prints.
     """
     measured_path, truth_path, methods = _inputs(args)
-    files = [f"{name}.h5" for name in methods]
-    folder = output_folder(args.out, [*files, "analysis.h5", "report.png", "filter.png", "metrics.json", "config.toml"])
+    files = [f"{name}{end}" for name in (*methods, "analysis") for end in (".h5", ".vtkhdf", "_wall.vtkhdf")]
+    files += ["members.h5", "quantities.json", "quantities.csv"]
+    files += ["report.png", "report.html", "filter.png", "metrics.json", "config.toml"]
+    folder = output_folder(args.out, files)
     device = parallel.own_device(usable_device(args.device))
     lead = parallel.is_lead()
     held = locked(folder) if lead else nullcontext(folder)
@@ -77,6 +92,7 @@ def assimilate(args: argparse.Namespace) -> None:
         also = [informative(geometry.read_recording(path), path) for path in args.also]
         truth = None if truth_path is None else geometry.read_recording(truth_path)
         check_spacing(args.spacing, measured)
+        read_out = methods_read_out(args, methods, measured)
         raw = metrics.evaluate(measured, truth, measured)  # first: a truth that does not fit must not cost a run
         saved, resume = folder / "checkpoint.pt", args.resume
         if "ensemble" in methods and lead:
@@ -98,6 +114,8 @@ def assimilate(args: argparse.Namespace) -> None:
                 seed=args.seed,
                 device=device,
                 progress=lead and shows_bar(args),
+                quantities=read_out,
+                keep_members=folder / "members.h5" if args.keep_members else None,
             )
         if not lead:
             return
@@ -148,21 +166,70 @@ def _write(
     if truth is not None:
         claims = {name: metrics.spread_over_skill(recording, truth) for name, recording in analyses.items()}
         config["spread_over_skill"] = {name: claim.value for name, claim in claims.items() if claim is not None}
+    tables = None
+    if args.quantities or results[config["analysis"]].quantities is not None:
+        tables = QuantityTables.of(analyses[config["analysis"]], results[config["analysis"]].quantities, truth)
     with staged(folder) as scratch:
         for name, recording in analyses.items():
             geometry.write_recording(scratch / f"{name}.h5", recording, provenance=account | {"method": name})
         shutil.copyfile(scratch / f"{config['analysis']}.h5", scratch / "analysis.h5")
+        for name in () if args.no_sidecar else (*analyses, "analysis"):
+            write_sidecar(scratch / f"{name}.h5", analyses[config["analysis"] if name == "analysis" else name])
         figures.draw_report(scratch / "report.png", measured, analyses, scores, truth, seconds)
         if "ensemble" in results:
             filter_figure(results["ensemble"].info["filter"]).savefig(scratch / "filter.png", dpi=110)
         write_config(scratch, args)
         write_json(scratch / "metrics.json", metrics_document(measured, scores, seconds, config))
+        if tables is not None:
+            tables.write(scratch, {key: value for key, value in config.items() if key != "info"})
+        if not args.no_page:
+            _write_page(scratch, measured, truth, results, scores, config)
     print_table(figures.scores_table(scores, seconds))
+    if tables is not None:
+        print_table(tables.table())
+        say(CAUTION)
     for words in results["ensemble"].info["filter"]["warnings"] if "ensemble" in results else ():
         say(f"ensemble: {words}")
     files = ", ".join(f"{name}.h5" for name in analyses)
-    say(f"wrote {files}, analysis.h5 (= {config['analysis']}.h5), report.png and metrics.json to {folder}/")
+    page = "" if args.no_page else "report.html, "
+    say(f"wrote {files}, analysis.h5 (= {config['analysis']}.h5), {page}report.png and metrics.json to {folder}/")
     say(figures.NOT_CLINICAL)
+
+
+def _write_page(
+    scratch: Path,
+    measured: geometry.Recording,
+    truth: geometry.Recording | None,
+    results: Mapping[str, by_name.MethodResult],
+    scores: Mapping[str, Scores],
+    config: Mapping[str, Any],
+) -> None:
+    """Write `report.html` of the analysis, with the quantities where they were written before.
+
+    Args:
+        scratch: folder of the results.
+        measured: the measurement.
+        truth: the true flow, or None.
+        results: of each method.
+        scores: of each method, and of the measurement as `raw`.
+        config: what was asked for.
+    """
+    chosen, quantities = config["analysis"], scratch / "quantities.json"
+    mended = [result.info["estimates"] for result in results.values() if "estimates" in result.info]
+    write_report(
+        scratch / "report.html",
+        results[chosen].recording,
+        measured,
+        truth=truth,
+        name=chosen,
+        title=f"Flow of {Path(config['measured']).name}",
+        scores=scores,
+        seconds={name: result.seconds for name, result in results.items()},
+        quantities=json.loads(quantities.read_text(encoding="utf-8")) if quantities.exists() else None,
+        estimates=mended[0] if mended else None,
+        account=config["info"]["provenance"],
+        notes=results["ensemble"].info["filter"]["warnings"] if "ensemble" in results else (),
+    )
 
 
 def _inputs(args: argparse.Namespace) -> tuple[Path, Path | None, tuple[str, ...]]:

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from tqdm import tqdm
 
 import geometry
@@ -24,8 +25,10 @@ from torchsph.assimilation import LETKF, RTPS, Filter, Localisation
 from torchsph.simulator.simulator import Simulator
 from torchsph.simulator.transfer.checks import check_grid
 
+from ..between_frames import BetweenFrames, FlowAt
 from ..measurement.observation_operator import Measurement
 from ..measurement.prepared import PreparedMeasurement
+from ..members.frames import FrameObserver
 from ..runtime import checkpoint
 from ..runtime.checkpoint import Saved
 from ..runtime.parallel import anywhere
@@ -39,10 +42,21 @@ from .options import EnsembleOptions
 
 @dataclass(frozen=True)
 class EnsembleRun:
-    """The analyses of a recording, with the standard deviation the filter claims, and the accounts."""
+    """The analyses of a recording, with the standard deviation the filter claims, and the accounts.
+
+    Attributes:
+        recording: the analyses.
+        info: the accounts.
+        model: simulator of the control, which `at` asks what lies between the frames.
+    """
 
     recording: geometry.Recording
     info: dict[str, Any] = field(default_factory=dict)
+    model: Simulator | None = None
+
+    def at(self, times: ArrayLike, points: ArrayLike) -> FlowAt:
+        """Velocity and deviation at any times (s) and points (n, D), m, between the frames as the model has it."""
+        return BetweenFrames(self.recording, self.model).at(times, points)
 
 
 def default_filter(measured: geometry.Recording, options: EnsembleOptions) -> LETKF:
@@ -67,6 +81,7 @@ def assimilate(
     watcher: Watcher | None = None,
     seed: int = 0,
     progress: bool = False,
+    observers: Sequence[FrameObserver] = (),
 ) -> EnsembleRun:
     """Assimilate measurements into an ensemble of SPH simulations, as this module's docstring says.
 
@@ -85,6 +100,8 @@ def assimilate(
         seed: of everything random. Under ``torch.distributed`` the processes share the simulations; the result is the
             same for any number of them.
         progress: show a bar.
+        observers: what is done with every frame, its members and accelerations, as the first process has them; not
+            with a lag, which changes analyses after their time.
 
     Returns:
         The analyses, with their claimed deviation and the accounts of the run.
@@ -100,6 +117,10 @@ def assimilate(
     if resume and checkpoints is None:
         raise ValueError("resume needs the file of checkpoints that the run before wrote")
     options = EnsembleOptions() if options is None else options
+    if observers and options.lag is not None:
+        raise ValueError(
+            "members are followed without a lag alone: later data change the analyses that they lie around"
+        )
     coarse = model if coarse is None else coarse
     given = measured if isinstance(measured, geometry.Recording) else measured.recording
     for one in (model, coarse):
@@ -117,18 +138,19 @@ def assimilate(
         saved.refuse_foreign(key)  # before the splines and error models that the cycle begins with
     cycle = Cycle(
         [Measurement(each, grid, options.kernel) for each in prepared],
-        Forecaster(model, coarse, grid, options.transfer, batch=options.batch, seed=seed),
+        Forecaster(model, coarse, grid, options.transfer, batch=options.batch, seed=seed, motion=bool(observers)),
         filter,
         options,
         members=members,
         truth=truth,
         seed=seed,
+        observers=observers,
     )
     state = checkpoint.shared_state(saved, key) if resume else None
     if state is not None:
         cycle.restore(state)
     _run(cycle, path, key, progress, watcher)
-    return EnsembleRun(cycle.analyses.recording(f"ensemble of {members} SPH simulations"), accounts_of(cycle))
+    return EnsembleRun(cycle.analyses.recording(f"ensemble of {members} SPH simulations"), accounts_of(cycle), model)
 
 
 def _run(cycle: Cycle, path: Path | None, key: str, progress: bool, watcher: Watcher | None) -> None:
