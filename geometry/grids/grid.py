@@ -177,12 +177,13 @@ class Grid:
         if values.ndim == 0 or values.shape[-1] != stencil.index.shape[-2]:
             raise ValueError(f"Grid.spread: {tuple(values.shape)} values for {stencil.index.shape[-2]} points")
         batch, count, index, weight = self._flat(stencil, lead)
-        rows = values.reshape(batch, -1, count).transpose(1, 2).reshape(batch * count, -1)
+        channels = math.prod(lead[stencil.index.ndim - 2 :])
+        rows = values.reshape(batch, channels, count).transpose(1, 2).reshape(batch * count, channels)
         total = values.new_zeros(batch * self.size, rows.shape[1])
         # One corner at a time: all 2^D at once would need 2^D times the memory.
         for corner in range(index.shape[1]):
             total = total.index_add(0, index[:, corner], rows * weight[:, corner, None].to(rows.dtype))
-        return total.reshape(batch, self.size, -1).transpose(1, 2).reshape(*lead, *self.shape)
+        return total.reshape(batch, self.size, channels).transpose(1, 2).reshape(*lead, *self.shape)
 
     def refined(self, spacing: float | Sequence[float]) -> Grid:
         """A grid of another spacing (m) from the same origin that covers the same box."""
