@@ -223,15 +223,20 @@ def _fill(
     matrix: np.ndarray,
     unit: float | None,
 ) -> None:
-    """Write a vector field into `result`, (T, D, *grid), frame by frame and component by component."""
+    """Write a vector field into `result`, (T, D, *grid), frame by frame and component by component.
+
+    Components that lie apart in the file come one after the other, so that each array is read from front to back.
+    """
     result[...] = 0
-    for frame in range(len(result)):
-        for component in range(result.shape[1]):
-            name, letters = (names[0], axes[0]) if len(names) == 1 else (names[component], axes[component])
-            values = lie.field(_slab(source, name, letters, frame, component))
-            values = values * (unit or _stated(source, name))
-            for axis in np.flatnonzero(matrix[:, component]):
-                result[frame, axis] += np.asarray(matrix[axis, component] * values, np.float32)
+    frames, components = range(len(result)), range(result.shape[1])
+    apart = len(names) > 1 or -1 < axes[0].find("c") < axes[0].find("t")
+    pairs = [(f, c) for c in components for f in frames] if apart else [(f, c) for f in frames for c in components]
+    for frame, component in pairs:
+        name, letters = (names[0], axes[0]) if len(names) == 1 else (names[component], axes[component])
+        values = lie.field(_slab(source, name, letters, frame, component))
+        values = values * (unit or _stated(source, name))
+        for axis in np.flatnonzero(matrix[:, component]):
+            result[frame, axis] += np.asarray(matrix[axis, component] * values, np.float32)
 
 
 def _slab(source: Source, name: str, letters: str, frame: int, component: int) -> np.ndarray:
