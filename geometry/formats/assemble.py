@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 
 from geometry.grids.grid import Grid
+from geometry.recordings.odd_files import PACKED, UNWRITTEN
 from geometry.recordings.units import factor
 
 from .field_map import FieldMap
@@ -15,6 +17,7 @@ from .orientation import Orientation
 from .source import ArrayLike, FormatError, Source
 
 MIRROR = {"ras": np.array([-1.0, -1.0, 1.0])}  # to LPS, the coordinates that DICOM, ITK and surfaces of Slicer use
+WHOLE = (".h5", ".hdf5", ".hdf", ".he5", ".mat", ".npz", ".vtkhdf", ".nc", ".nc4", ".nii", ".gz", ".nrrd", ".mha")
 DECLARED = 64 * 2**30  # bytes; a file that claims a larger result is refused before anything is read
 
 
@@ -56,10 +59,7 @@ def assemble(source: Source, said: FieldMap) -> Fields:
     _check_components(source, names, sizes, dimension)
     counts = tuple(sizes[0][letter] for letter in "xyz"[:dimension])
     frames = sizes[0].get("t", 1)
-    if 4 * dimension * frames * int(np.prod(counts)) > DECLARED:
-        raise FormatError(
-            f"{source.path}: {names[0]}: claims {frames} frames of {counts} nodes, more than memory holds"
-        )
+    _check_size(source, names[0], 4 * dimension * frames * int(np.prod(counts)), f"{frames} frames of {counts} nodes")
     lie = Orientation.of(_affine(source, said, counts), counts, source.path)
     grid = Grid(tuple(lie.origin), tuple(lie.spacing), tuple(counts[lie.order[a]] for a in reversed(range(dimension))))
     matrix = _matrix(source, said, lie)
@@ -146,6 +146,18 @@ def _check_components(source: Source, names: Sequence[str], sizes: list[dict[str
     if count != dimension and (dimension, count, len(names)) != (2, 3, 1):  # a plane of vectors in space: its z is left
         raise FormatError(
             f"{source.path}: {dimension} components of velocity are needed, not {count} ({', '.join(names)})"
+        )
+
+
+def _check_size(source: Source, name: str, needed: int, claimed: str) -> None:
+    """Refuse, before anything is read, a result larger than memory or than the file can have packed."""
+    if needed > DECLARED:
+        raise FormatError(f"{source.path}: {name}: claims {claimed}, more than memory holds")
+    path = Path(source.path)
+    if path.suffix.lower() in WHOLE and path.is_file() and needed > UNWRITTEN + PACKED * path.stat().st_size:
+        raise FormatError(
+            f"{source.path}: {name}: claims {claimed}, but the whole file has {path.stat().st_size} bytes; write the "
+            "values, or name other arrays"
         )
 
 

@@ -110,8 +110,8 @@ def _in_a_row(first: Source, paths: Sequence[Path], said: FieldMap, format: str)
 def _part(source: Source, said: FieldMap, *, alone: bool) -> tuple[Fields, str]:
     """The fields of a file, which is closed; where it has no times, those of a series come later."""
     try:
-        later = not alone and source.time is None
-        return _assembled(source, replace(said, interval=None, time=(0.0,)) if later else said)
+        later = not alone and source.time is None and not (isinstance(said.time, str) and said.time)
+        return _assembled(source, replace(said, interval=1.0, time="") if later else said)
     finally:
         source.close()
 
