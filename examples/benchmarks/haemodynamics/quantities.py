@@ -50,15 +50,16 @@ NUMBERS = ("stroke_volume", "filling_volume", "e_over_a", "energy_lost", "kineti
 class Fields:
     """Curves, pressure and vorticity of one recording's frames, du/dt by differences of them."""
 
-    def __init__(self, recording: geometry.Recording, *, own_sigma: bool = False) -> None:
-        domain = FlowDomain.from_recording(recording)
-        sampler = geometry.WallSampler(domain.motion, min(domain.grid.spacing))
+    def __init__(
+        self, recording: geometry.Recording, frames: list[FrameQuantities], *, own_sigma: bool = False
+    ) -> None:
+        domain = frames[0].domain
         velocity = np.nan_to_num(filled_velocity(recording)).astype(np.float64)
         made = []
         for n in range(recording.frames):
             rate = time_derivative(velocity, domain.mask, domain.time, n, events=domain.events)
             sigma = recording.sigma[n] if own_sigma and recording.sigma is not None else None
-            made.append(FrameQuantities(domain, n, sampler).of(velocity[n], rate, sigma=sigma))
+            made.append(frames[n].of(velocity[n], rate, sigma=sigma))
         self.time = recording.time
         self.curves = {name: np.array([one.curves[name] for one in made]) for name in UNITS}
         self.pressure = np.stack([one.pressure for one in made])
@@ -81,9 +82,16 @@ def field_error(found: np.ndarray, true: np.ndarray, mask: np.ndarray, *, centre
     return float(np.sqrt(errors / sizes))
 
 
-def drops(domain: FlowDomain, pressure: np.ndarray) -> np.ndarray:
+def frames_of(recording: geometry.Recording) -> list[FrameQuantities]:
+    """What depends on masks and walls alone, frame by frame."""
+    domain = FlowDomain.from_recording(recording)
+    sampler = geometry.WallSampler(domain.motion, min(domain.grid.spacing))
+    return [FrameQuantities(domain, n, sampler) for n in range(recording.frames)]
+
+
+def drops(frames: list[FrameQuantities], pressure: np.ndarray) -> np.ndarray:
     """Base less apex `(T,)`, Pa, of pressures `(T, *shape)`."""
-    return np.array([float(FrameQuantities(domain, n).pressure_difference(p)) for n, p in enumerate(pressure)])
+    return np.array([float(frame.pressure_difference(p)) for frame, p in zip(frames, pressure, strict=True)])
 
 
 def waves(times: np.ndarray, curve: np.ndarray, window: tuple[float, float]) -> list[float]:
@@ -116,14 +124,16 @@ def components(recording: geometry.Recording, velocity: np.ndarray, walls: Movin
     return [found.direct, found.retained, found.delayed, found.residual]
 
 
-def members_of(run: Path, analysis: geometry.Recording) -> tuple[MemberQuantities, dict[str, np.ndarray], float]:
+def members_of(
+    run: Path, analysis: geometry.Recording, frames: list[FrameQuantities]
+) -> tuple[MemberQuantities, dict[str, np.ndarray], float]:
     """Quantities of all members, the fields of the pressure, and the seconds that the quantities took."""
     quantities, pressures, seconds = MemberQuantities(analysis), [], 0.0
     for frame in read_members(run / "members.h5", analysis):
         began = time.process_time()
         quantities.take(frame)
         seconds += time.process_time() - began
-        of_frame = FrameQuantities(quantities.domain, frame.frame)
+        of_frame = frames[frame.frame]
         estimate = of_frame.of(frame.field, frame.rate).pressure
         members = of_frame.of(frame.members, frame.member_rates).pressure
         simulated = (
@@ -153,19 +163,19 @@ def main() -> None:
     ensemble = geometry.read_recording(options.run / "ensemble.h5")
     chosen = matching_frames(measured.time, every.time, "the truth")
     true = every.select(chosen)
-    mask, domain = np.asarray(true.mask, bool), FlowDomain.from_recording(true)
-    whole = Fields(every)
+    mask, frames, all_frames = np.asarray(true.mask, bool), frames_of(true), frames_of(every)
+    domain, whole = frames[0].domain, Fields(every, all_frames)
     right = {name: curve[chosen] for name, curve in whole.curves.items()}
     pressure = np.asarray(true.pressure, np.float64)
-    right["pressure_difference"] = drops(domain, pressure)
+    right["pressure_difference"] = drops(frames, pressure)
     sources = {
-        "formula": Fields(true),
-        "raw": Fields(measured),
-        "spline": Fields(spline),
-        "ensemble": Fields(ensemble),
-        "with variance": Fields(ensemble, own_sigma=True),
+        "formula": Fields(true, frames),
+        "raw": Fields(measured, frames),
+        "spline": Fields(spline, frames),
+        "ensemble": Fields(ensemble, frames),
+        "with variance": Fields(ensemble, frames, own_sigma=True),
     }
-    quantities, pressures, seconds = members_of(options.run, ensemble)
+    quantities, pressures, seconds = members_of(options.run, ensemble, frames)
     found = quantities.found()
     bands = found.bands()
     curves = {name: one.curves for name, one in sources.items()}
@@ -179,8 +189,8 @@ def main() -> None:
     fields = {name: one.pressure for name, one in sources.items() if name != "with variance"} | pressures
     result["fields"]["pressure"] = {s: field_error(p, pressure, mask, centred=True) for s, p in fields.items()}
     fills = next((row[1], row[2]) for row in domain.intervals if int(row[0]) == domain.inlet)
-    reference = waves(every.time, drops(FlowDomain.from_recording(every), every.pressure), fills)
-    lines = {source: drops(domain, field) for source, field in fields.items()}
+    reference = waves(every.time, drops(all_frames, every.pressure), fills)
+    lines = {source: drops(frames, field) for source, field in fields.items()}
     for source, curve in lines.items():
         correlation = float(np.corrcoef(curve, right["pressure_difference"])[0, 1])
         result["pressure difference"][source] = {
