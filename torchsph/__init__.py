@@ -13,6 +13,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from .methods.between_frames import BetweenFrames
     from .methods.by_name import DEFAULT_METHOD, METHODS, MethodResult, forecast_skill, make_model, run_methods
     from .methods.ensemble.assimilate import EnsembleRun, assimilate, default_filter
     from .methods.ensemble.options import EnsembleOptions, Estimated
@@ -21,7 +22,9 @@ if TYPE_CHECKING:
     from .methods.measurement.frame_splines import smooth
     from .methods.measurement.prepared import PreparedMeasurement as PreparedMeasurement
     from .methods.nudging import FilteredRun, filter_sph
+    from .methods.resample import resample
     from .pairs.smoothing_kernels import KERNELS, SmoothingKernel, kernel
+    from .report.write import write_report
     from .simulator.failures import NumericalFailure
     from .simulator.grid_forecast import GridForecast, Transfer
     from .simulator.residual_motion import ResidualMotion, residual_motion
@@ -36,6 +39,7 @@ if TYPE_CHECKING:
     from .simulator.seeding import Seeding
     from .simulator.simulation import Simulation
     from .simulator.simulator import Simulator
+    from .simulator.transfer.particle_series import ParticleSeries
 
 __version__ = "0.1.0"  # the one place: pyproject.toml reads it from here, without importing
 
@@ -45,6 +49,7 @@ __all__ = [
     "METHODS",
     "PRESETS",
     "XSPH",
+    "BetweenFrames",
     "CompleteKernelWall",
     "EnsembleOptions",
     "EnsembleRun",
@@ -57,6 +62,7 @@ __all__ = [
     "MethodResult",
     "NumericalFailure",
     "ObservationError",
+    "ParticleSeries",
     "PopulationControl",
     "PotentialWall",
     "PressureSource",
@@ -81,14 +87,17 @@ __all__ = [
     "kernel",
     "make_model",
     "preset",
+    "resample",
     "residual_motion",
     "run_methods",
     "skill",
     "smooth",
+    "write_report",
 ]
 
 # where each public name lives, as the imports above have it
 _HOMES = {
+    "methods.between_frames": ("BetweenFrames",),
     "methods.by_name": (
         "DEFAULT_METHOD",
         "METHODS",
@@ -120,11 +129,13 @@ _HOMES = {
         "FilteredRun",
         "filter_sph",
     ),
+    "methods.resample": ("resample",),
     "pairs.smoothing_kernels": (
         "KERNELS",
         "SmoothingKernel",
         "kernel",
     ),
+    "report.write": ("write_report",),
     "simulator.failures": ("NumericalFailure",),
     "simulator.grid_forecast": (
         "GridForecast",
@@ -162,6 +173,7 @@ _HOMES = {
     "simulator.seeding": ("Seeding",),
     "simulator.simulation": ("Simulation",),
     "simulator.simulator": ("Simulator",),
+    "simulator.transfer.particle_series": ("ParticleSeries",),
 }
 
 _ROOMS = (
@@ -173,6 +185,7 @@ _ROOMS = (
     "methods",
     "native",
     "pairs",
+    "report",
     "simulator",
     "ultrasound",
     "validation",

@@ -207,8 +207,11 @@ class Recording:
         """Some of the frames, in increasing order of time: a slice, frame numbers or a bool for each frame.
 
         The period stays what it is: frames left out do not change the motion that they sample.
+
+        Raises:
+            ValueError: there are no such frames, or none is left.
         """
-        chosen = np.arange(self.frames)[frames if isinstance(frames, slice) else np.asarray(frames)]
+        chosen = _numbers(frames, self.frames)
         changes: dict[str, Any] = {"wall": None if self.wall is None else self.wall.select(chosen)}
         changes["fluxes"] = tuple(flux.select(chosen) for flux in self.fluxes)
         for name, _, _ in LAYOUT:
@@ -272,6 +275,18 @@ def _coerce(instance: Wall | Recording, prefix: str) -> None:
             except ValueError as fault:
                 raise RecordingError("recording", datasets[item.name], str(fault)) from fault
             object.__setattr__(instance, item.name, array)
+
+
+def _numbers(frames: slice | Sequence[int] | np.ndarray, count: int) -> np.ndarray:
+    """Frame numbers (n,) that a slice, numbers or bools stand for, of ``count`` frames."""
+    if isinstance(frames, slice):
+        return np.arange(count)[frames]
+    asked = np.asarray(frames)
+    numbers = asked.dtype.kind in "iu" and bool(((asked >= -count) & (asked < count)).all())
+    if asked.ndim != 1 or not (numbers or (asked.dtype.kind == "b" and len(asked) == count)):
+        what = f"{asked.dtype} of the shape {asked.shape}" if asked.dtype.kind not in "iu" else f"numbers {frames}"
+        raise ValueError(f"frames must be a slice, numbers from 0 to {count - 1} or {count} bools, not {what}")
+    return np.arange(count)[asked]
 
 
 def _check_shapes(recording: Recording) -> None:

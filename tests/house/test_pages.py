@@ -17,6 +17,7 @@ MADE = {  # by commands and by the build
     "metrics.json",
     "quantities.json",
     "report.png",
+    "report.html",
     "filter.png",
     "checkpoint.pt",
     "analysis.h5",

@@ -9,7 +9,20 @@ from torchsph import __version__
 
 from .arguments import Parser
 from .command import Command
-from .commands import assimilate, batch, collect, convert, export, forecast, info, measure, quantify, smooth
+from .commands import (
+    assimilate,
+    batch,
+    collect,
+    convert,
+    export,
+    forecast,
+    info,
+    measure,
+    quantify,
+    report,
+    resample,
+    smooth,
+)
 from .running.notes import add_notes_options
 from .running.settings import config_named, take_config
 
@@ -21,6 +34,8 @@ COMMANDS: tuple[Command, ...] = (
     measure.COMMAND,
     smooth.COMMAND,
     quantify.COMMAND,
+    report.COMMAND,
+    resample.COMMAND,
     info.COMMAND,
     convert.COMMAND,
     export.COMMAND,

@@ -11,7 +11,7 @@ import geometry
 
 from .boundary_flow import sample_inside
 
-__all__ = ["Cut", "Plane", "cut", "valve_plane"]
+__all__ = ["Cut", "Plane", "body_points", "cut", "valve_plane"]
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ def valve_plane(recording: geometry.Recording) -> Plane:
 
     With fewer than two orifices the principal axes of the surface serve; a plane recording is its own plane.
     """
-    points = _body(recording)
+    points = body_points(recording)
     if recording.dimension == 2:
         origin, across, along = np.zeros(2), np.array([1.0, 0.0]), np.array([0.0, 1.0])
     else:
@@ -50,7 +50,7 @@ def valve_plane(recording: geometry.Recording) -> Plane:
     return Plane(origin, across, along, (s.min() - margin, s.max() + margin, t.min() - margin, t.max() + margin))
 
 
-def _body(recording: geometry.Recording) -> np.ndarray:
+def body_points(recording: geometry.Recording) -> np.ndarray:
     """Points (n, D), m, of the wall at all frames; without a wall the nodes that are ever in the mask."""
     if recording.wall is not None:
         return recording.wall.vertices.reshape(-1, recording.dimension)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time as clock
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
@@ -28,7 +27,7 @@ from .members.kept import MemberFile
 from .members.quantities import MemberCurves, MemberQuantities, quantified, with_pressure
 from .memory import MemoryPrediction, free_memory, predicted
 from .nudging import filter_sph
-from .runtime import checkpoint
+from .runtime.checkpoint import Saved
 from .runtime.parallel import from_last, is_last, is_lead
 from .runtime.watching import Watcher
 
@@ -42,6 +41,8 @@ DEFAULT_MEMBERS = 16
 # particle spacing in grid spacings of the single runs and of the ensemble's members; its control run takes half of it
 ANALYSIS_SPACING = 2.0
 CONTROL_SHARE = 0.5
+# of a recording's frames, what forecasts from them hold at once beside those that are saved
+FORECAST_COPIES = 2
 
 # Between frames that correct it, coarser particles resolve less in time as well: in a human ventricle with 3 and 6 mm,
 # steps of up to 0.7 spacings per m/s leave the ensemble's error as it is (.410, .409 with 0.7 ms) at 0.64 times the
@@ -98,7 +99,7 @@ def run_methods(
     lag: int | None = None,
     minimum_members: int | None = None,
     checkpoints: str | Path | None = None,
-    resume: bool = False,
+    resume: bool | Saved = False,
     watcher: Watcher | None = None,
     seed: int = 0,
     device: str = "cpu",
@@ -133,6 +134,8 @@ def run_methods(
     predicted_memory(prepared, methods, preset, models.spacing, count, also).refuse_beyond(free_memory())
     ensemble = None
     if "ensemble" in methods:
+        if resume is True and checkpoints is not None and is_lead():
+            resume = Saved.read(Path(checkpoints)) or True
         ensemble = _EnsembleCall(
             prepared,
             models,
@@ -180,12 +183,22 @@ def predicted_memory(
     if "ensemble" in methods:
         runs = [(spacing, min(members, EnsembleOptions().batch)), (CONTROL_SHARE * spacing, 1)]
     return predicted(
-        prepared,
+        prepared.recording,
         scheme_preset(preset),
+        splines=prepared.splines,
         spacings=runs,
         members=members if "ensemble" in methods else 0,
         further=also,
     )
+
+
+def predicted_forecast_memory(
+    recording: geometry.Recording, saved: Sequence[float] = (), preset: str = "default", spacing: float | None = None
+) -> MemoryPrediction:
+    """What ``forecast_skill`` with the same options will take, where the forecasts at the leads ``saved`` are kept."""
+    spacing = min(recording.grid.spacing) if spacing is None else spacing
+    copies = FORECAST_COPIES + 2 * len(saved)
+    return predicted(recording, scheme_preset(preset), spacings=[(spacing, 1)], copies=copies)
 
 
 def _spacing(prepared: PreparedMeasurement, asked: float | None) -> float:
@@ -228,14 +241,14 @@ class _EnsembleCall:
     options: EnsembleOptions
     truth: geometry.Recording | None
     checkpoints: Path | None
-    resume: bool
+    resume: bool | Saved
     seed: int
     quantities: bool = False
     keep_members: Path | None = None
 
     def refuse_foreign_checkpoint(self) -> None:
         """Tell another run's checkpoint before splines and free runs have taken their minutes."""
-        if not self.resume or self.checkpoints is None or not is_lead() or not os.path.lexists(self.checkpoints):
+        if not isinstance(self.resume, Saved):
             return
         key = ensemble_key(
             [self.prepared, *(further(one, self.prepared) for one in self.also)],
@@ -247,7 +260,7 @@ class _EnsembleCall:
             seed=self.seed,
             truth=self.truth,
         )
-        checkpoint.refuse_foreign(self.checkpoints, key)
+        self.resume.refuse_foreign(key)
 
     def run(self, watcher: Watcher | None, progress: bool) -> tuple[EnsembleRun, MemberCurves | None]:
         """The ensemble's analyses, and what its members give where it is asked for."""
@@ -325,8 +338,13 @@ def forecast_skill(
     progress: bool = False,
     seed: int = 0,
 ) -> ForecastSkill:
-    """Skill of the simulator on a recording; see ``skill``. ``spacing`` (m) defaults to the grid's."""
+    """Skill of the simulator on a recording; see ``skill``. ``spacing`` (m) defaults to the grid's.
+
+    Raises:
+        NotEnoughMemory: more would be needed than is free.
+    """
     began = clock.perf_counter()
+    predicted_forecast_memory(recording, leads if save else (), preset, spacing).refuse_beyond(free_memory())
     model = make_model(recording, preset=preset, spacing=spacing, device=device)
     made = clock.perf_counter() - began
     result = skill(recording, model, leads, every=every, save=save, progress=progress, seed=seed)

@@ -48,15 +48,14 @@ class AdvancingRun:
         parameters: the numbers of the scheme in use.
         record: accounts of the run.
         time: present time, s.
-        on_step: called after every step with its middle and its length of each member (members,), s, 0 where one waits;
-            None: nobody looks on, which costs nothing.
+        observers: each is called after every step with the present times of the members (members,), s, and the lengths
+            of their steps (members,), s, 0 where one waits or has failed; none: nobody looks on, which costs nothing.
     """
-
-    on_step: Callable[[Tensor, Tensor], None] | None = None
 
     def __init__(self, domain: Domain, backend: Backend, particles: Particles, time: float) -> None:
         self.domain, self.units, self.particles, self.time = domain, domain.units, particles, float(time)
         self.surroundings, self._backend = PresentSurroundings(domain), backend
+        self.observers: list[Callable[[Tensor, Tensor], None]] = []
         scene, scheme = domain.scene, domain.scheme
         self.record = Record(particles.members, len(scene.valves), particles.position.device)
         self.parameters = Parameters.of(scheme, scene.fluid.viscosity)
@@ -170,9 +169,10 @@ class AdvancingRun:
             self.surroundings.at(self.time + done * self.units.time)
             self._prepare_step(step > 0)
             done = self._take_step(step, done, earlier)
-            if self.on_step is not None:
-                length = torch.where(self.record.failed, torch.zeros_like(step), step)
-                self.on_step(self.time + (done - 0.5 * step) * self.units.time, length * self.units.time)
+            if self.observers:
+                length = torch.where(self.record.failed, torch.zeros_like(step), step) * self.units.time
+                for observer in self.observers:
+                    observer(self.time + done * self.units.time, length)
 
     def _ramp(self, done: Tensor) -> None:
         """Let gamma grow, where the scheme has it grow."""
@@ -191,7 +191,7 @@ class AdvancingRun:
 
         Particles that have crossed an open valve change sides in every step: the flow must not feel the search.
         """
-        particles, renumbered = self.surroundings.exchange(self.particles, self.record, self._stepper.pressure)
+        particles, renumbered = self.surroundings.exchange(self.particles, self.record, self._stepper.pressure, active)
         if self._population is not None:
             particles, changed = self._population.controlled_when_due(particles, active)
             renumbered |= changed
@@ -199,7 +199,7 @@ class AdvancingRun:
             self._acceleration = rows_carried(self.particles, particles, self._acceleration)
         self.particles = particles
         if self._pressures is not None:
-            self.particles = self._pressures.driven(self.particles, self.surroundings.clock, self._stepper)
+            self.particles = self._pressures.driven(self.particles, self.surroundings.clock, self._stepper, active)
         self.particles, self._acceleration = self._spatial.when_due(self.particles, self._acceleration)
 
     def _take_step(self, step: Tensor, done: Tensor, earlier: RollbackStates | None) -> Tensor:

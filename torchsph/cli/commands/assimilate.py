@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 import shutil
 from collections.abc import Mapping
 from contextlib import nullcontext
@@ -10,14 +11,16 @@ from pathlib import Path
 from typing import Any
 
 import geometry
+from geometry.formats import write_sidecar
 from torchsph import data
 from torchsph.assimilation import filter_figure
 from torchsph.evaluation import figures, metrics
 from torchsph.evaluation.scores import Scores
 from torchsph.methods import by_name
 from torchsph.methods.runtime import checkpoint, parallel
+from torchsph.report import write_report
 
-from ..arguments import add_model_options, add_output_folder, add_seed, names, whole
+from ..arguments import add_model_options, add_output_folder, add_seed, add_sidecar, names, whole
 from ..checks import check_spacing, informative, usable_device
 from ..command import Command
 from ..outputs import output_folder, staged, write_json
@@ -58,7 +61,9 @@ def add_method_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--minimum-members", type=whole(1), metavar="N", help="end the run where fewer live through a forecast (1)"
     )
+    parser.add_argument("--no-page", action="store_true", help="leave out report.html")
     add_seed(parser)
+    add_sidecar(parser)
     parser.add_argument(
         "--quantities",
         action="store_true",
@@ -74,8 +79,10 @@ def assimilate(args: argparse.Namespace) -> None:
     Under torchrun the processes share the ensemble's simulations; the first one writes and prints.
     """
     measured_path, truth_path, methods = _inputs(args)
-    files = [f"{name}.h5" for name in (*methods, "members")] + ["quantities.json", "quantities.csv"]
-    folder = output_folder(args.out, [*files, "analysis.h5", "report.png", "filter.png", "metrics.json", "config.toml"])
+    files = [f"{name}{end}" for name in (*methods, "analysis") for end in (".h5", ".vtkhdf", "_wall.vtkhdf")]
+    files += ["members.h5", "quantities.json", "quantities.csv"]
+    files += ["report.png", "report.html", "filter.png", "metrics.json", "config.toml"]
+    folder = output_folder(args.out, files)
     device = parallel.own_device(usable_device(args.device))
     lead = parallel.is_lead()
     held = locked(folder) if lead else nullcontext(folder)
@@ -87,9 +94,9 @@ def assimilate(args: argparse.Namespace) -> None:
         check_spacing(args.spacing, measured)
         read_out = methods_read_out(args, methods, measured)
         raw = metrics.evaluate(measured, truth, measured)  # first: a truth that does not fit must not cost a run
-        saved = folder / "checkpoint.pt"
+        saved, resume = folder / "checkpoint.pt", args.resume
         if "ensemble" in methods and lead:
-            _check_checkpoint(saved, args.resume)
+            resume = _kept(saved, args.resume)
         with parallel.joined():
             results = by_name.run_methods(
                 measured,
@@ -102,7 +109,7 @@ def assimilate(args: argparse.Namespace) -> None:
                 also=also,
                 truth=truth,
                 checkpoints=saved,
-                resume=args.resume,
+                resume=resume,
                 watcher=RunWatcher(signals, status),
                 seed=args.seed,
                 device=device,
@@ -120,14 +127,14 @@ def assimilate(args: argparse.Namespace) -> None:
             saved.unlink(missing_ok=True)  # the run is complete: there is nothing to go on with
 
 
-def _check_checkpoint(saved: Path, resume: bool) -> None:
-    """Refuse, before any work, a checkpoint that cannot be gone on from, and a file that one would replace."""
+def _kept(saved: Path, resume: bool) -> bool | checkpoint.Saved:
+    """What to go on from, refused before any work where it cannot be; also refused is a file that would be replaced."""
     if resume:
-        checkpoint.refuse_damaged(saved)
-        return
+        return checkpoint.Saved.read(saved) or True
     checkpoint.refuse_other_file(saved)
     if saved.exists():
         say(f"{saved}: an earlier run was interrupted; this one begins anew and replaces it (--resume goes on with it)")
+    return False
 
 
 def _write(
@@ -166,6 +173,8 @@ def _write(
         for name, recording in analyses.items():
             geometry.write_recording(scratch / f"{name}.h5", recording, provenance=account | {"method": name})
         shutil.copyfile(scratch / f"{config['analysis']}.h5", scratch / "analysis.h5")
+        for name in () if args.no_sidecar else (*analyses, "analysis"):
+            write_sidecar(scratch / f"{name}.h5", analyses[config["analysis"] if name == "analysis" else name])
         figures.draw_report(scratch / "report.png", measured, analyses, scores, truth, seconds)
         if "ensemble" in results:
             filter_figure(results["ensemble"].info["filter"]).savefig(scratch / "filter.png", dpi=110)
@@ -173,6 +182,8 @@ def _write(
         write_json(scratch / "metrics.json", metrics_document(measured, scores, seconds, config))
         if tables is not None:
             tables.write(scratch, {key: value for key, value in config.items() if key != "info"})
+        if not args.no_page:
+            _write_page(scratch, measured, truth, results, scores, config)
     print_table(figures.scores_table(scores, seconds))
     if tables is not None:
         print_table(tables.table())
@@ -180,8 +191,45 @@ def _write(
     for words in results["ensemble"].info["filter"]["warnings"] if "ensemble" in results else ():
         say(f"ensemble: {words}")
     files = ", ".join(f"{name}.h5" for name in analyses)
-    say(f"wrote {files}, analysis.h5 (= {config['analysis']}.h5), report.png and metrics.json to {folder}/")
+    page = "" if args.no_page else "report.html, "
+    say(f"wrote {files}, analysis.h5 (= {config['analysis']}.h5), {page}report.png and metrics.json to {folder}/")
     say(figures.NOT_CLINICAL)
+
+
+def _write_page(
+    scratch: Path,
+    measured: geometry.Recording,
+    truth: geometry.Recording | None,
+    results: Mapping[str, by_name.MethodResult],
+    scores: Mapping[str, Scores],
+    config: Mapping[str, Any],
+) -> None:
+    """Write `report.html` of the analysis, with the quantities where they were written before.
+
+    Args:
+        scratch: folder of the results.
+        measured: the measurement.
+        truth: the true flow, or None.
+        results: of each method.
+        scores: of each method, and of the measurement as `raw`.
+        config: what was asked for.
+    """
+    chosen, quantities = config["analysis"], scratch / "quantities.json"
+    mended = [result.info["estimates"] for result in results.values() if "estimates" in result.info]
+    write_report(
+        scratch / "report.html",
+        results[chosen].recording,
+        measured,
+        truth=truth,
+        name=chosen,
+        title=f"Flow of {Path(config['measured']).name}",
+        scores=scores,
+        seconds={name: result.seconds for name, result in results.items()},
+        quantities=json.loads(quantities.read_text(encoding="utf-8")) if quantities.exists() else None,
+        estimates=mended[0] if mended else None,
+        account=config["info"]["provenance"],
+        notes=results["ensemble"].info["filter"]["warnings"] if "ensemble" in results else (),
+    )
 
 
 def _inputs(args: argparse.Namespace) -> tuple[Path, Path | None, tuple[str, ...]]:

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from tqdm import tqdm
 
 import geometry
@@ -24,10 +25,12 @@ from torchsph.assimilation import LETKF, RTPS, Filter, Localisation
 from torchsph.simulator.simulator import Simulator
 from torchsph.simulator.transfer.checks import check_grid
 
+from ..between_frames import BetweenFrames, FlowAt
 from ..measurement.observation_operator import Measurement
 from ..measurement.prepared import PreparedMeasurement
 from ..members.frames import FrameObserver
 from ..runtime import checkpoint
+from ..runtime.checkpoint import Saved
 from ..runtime.parallel import anywhere
 from ..runtime.watching import FrameDone, Stopped, Watcher
 from .accounts import accounts_of
@@ -39,10 +42,21 @@ from .options import EnsembleOptions
 
 @dataclass(frozen=True)
 class EnsembleRun:
-    """The analyses of a recording, with the standard deviation the filter claims, and the accounts."""
+    """The analyses of a recording, with the standard deviation the filter claims, and the accounts.
+
+    Attributes:
+        recording: the analyses.
+        info: the accounts.
+        model: simulator of the control, which `at` asks what lies between the frames.
+    """
 
     recording: geometry.Recording
     info: dict[str, Any] = field(default_factory=dict)
+    model: Simulator | None = None
+
+    def at(self, times: ArrayLike, points: ArrayLike) -> FlowAt:
+        """Velocity and deviation at any times (s) and points (n, D), m, between the frames as the model has it."""
+        return BetweenFrames(self.recording, self.model).at(times, points)
 
 
 def default_filter(measured: geometry.Recording, options: EnsembleOptions) -> LETKF:
@@ -63,7 +77,7 @@ def assimilate(
     also: Sequence[geometry.Recording | PreparedMeasurement] = (),
     truth: geometry.Recording | None = None,
     checkpoints: str | Path | None = None,
-    resume: bool = False,
+    resume: bool | Saved = False,
     watcher: Watcher | None = None,
     seed: int = 0,
     progress: bool = False,
@@ -81,7 +95,7 @@ def assimilate(
             the forecast at its own time and enters the next analysis.
         truth: for the scores in the record alone. It never enters an analysis.
         checkpoints: file to which every cycle writes its state.
-        resume: go on from it where it is there.
+        resume: go on from it where it is there; or the checkpoint itself, where it was read already.
         watcher: is told of every frame, and may ask the run to stop; in one process or in all of them.
         seed: of everything random. Under ``torch.distributed`` the processes share the simulations; the result is the
             same for any number of them.
@@ -119,8 +133,9 @@ def assimilate(
     filter = default_filter(first.recording, options) if filter is None else filter
     key = ensemble_key(prepared, model, coarse, filter, options, members=members, seed=seed, truth=truth)
     path = None if checkpoints is None else Path(checkpoints)
-    if resume and path is not None:
-        checkpoint.refuse_foreign(path, key)  # before the splines and error models that the cycle begins with
+    saved = Saved.read(path) if resume is True and path is not None else resume or None
+    if saved is not None:
+        saved.refuse_foreign(key)  # before the splines and error models that the cycle begins with
     cycle = Cycle(
         [Measurement(each, grid, options.kernel) for each in prepared],
         Forecaster(model, coarse, grid, options.transfer, batch=options.batch, seed=seed, motion=bool(observers)),
@@ -131,11 +146,11 @@ def assimilate(
         seed=seed,
         observers=observers,
     )
-    state = checkpoint.load(path, key) if resume and path is not None else None
+    state = checkpoint.shared_state(saved, key) if resume else None
     if state is not None:
         cycle.restore(state)
     _run(cycle, path, key, progress, watcher)
-    return EnsembleRun(cycle.analyses.recording(f"ensemble of {members} SPH simulations"), accounts_of(cycle))
+    return EnsembleRun(cycle.analyses.recording(f"ensemble of {members} SPH simulations"), accounts_of(cycle), model)
 
 
 def _run(cycle: Cycle, path: Path | None, key: str, progress: bool, watcher: Watcher | None) -> None:

@@ -218,7 +218,7 @@ class Forecaster:
             model, self.grid, states.to(model.device), known, start, self.transfer, seed=self.seed, rates=motion
         )
         if averages is not None:
-            going.run.on_step = partial(averages.note, going.run)
+            going.run.observers.append(partial(averages.note, going.run))
         if parameters:
             going.run.change(**{name: row.to(torch.float32) for name, row in parameters.items()})
         found, record = [], going.run.record

@@ -43,7 +43,7 @@ class Stepping(Protocol):
 
 
 class PressureAverages:
-    """Averages over spans of time of a run that calls ``note`` after every step (``AdvancingRun.on_step``).
+    """Averages over spans of time of a run that calls ``note`` after every step (``AdvancingRun.observers``).
 
     Args:
         grid: the nodes, m.
@@ -57,8 +57,9 @@ class PressureAverages:
         self._sums: list[Tensor | None] = [None] * len(self.spans)
         self._weights: list[Tensor | None] = [None] * len(self.spans)
 
-    def note(self, run: Stepping, middle: Tensor, length: Tensor) -> None:
-        """Count one step of each member: its ``middle`` (members,), s, and ``length`` (members,), s, 0 where none."""
+    def note(self, run: Stepping, time: Tensor, length: Tensor) -> None:
+        """Count one step of each member, to ``time`` (members,), s, and of ``length`` (members,), s, 0 where none."""
+        middle = time - 0.5 * length
         for number, (begin, end) in enumerate(self.spans):
             weight = torch.where((middle >= begin) & (middle < end), length, torch.zeros_like(length))
             if not bool((weight > 0).any()):

@@ -61,7 +61,7 @@ def forecast(recording, spacing, start, end, spans):
     first = torch.from_numpy(recording.velocity[start])
     going = GridForecast(model, recording.grid, first, masks[0], times[0], Transfer(), rates=True)
     averages = PressureAverages(recording.grid, [masks[1]] * len(spans), spans)
-    going.run.on_step = partial(averages.note, going.run)
+    going.run.observers.append(partial(averages.note, going.run))
     going.at(times[1], masks[1])
     return going, averages.fields(1)[0].numpy(), masks
 
@@ -109,7 +109,7 @@ def test_looking_on_changes_no_bit(recording):
         going = GridForecast(model, recording.grid, first, mask, 0.0, Transfer(), rates=rates_asked)
         if rates_asked:
             averages = PressureAverages(recording.grid, [mask], [(0.0, 1.0)])
-            going.run.on_step = partial(averages.note, going.run)
+            going.run.observers.append(partial(averages.note, going.run))
         runs.append(going.at(0.005, mask)[0])
     assert torch.equal(*runs)
 
