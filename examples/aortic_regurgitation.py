@@ -45,7 +45,7 @@ def share_through_outlet(recording: geometry.Recording, body: PulsatingEllipsoid
     """Volume through the outlet over the whole that came in."""
     sampler, time = geometry.WallSampler(geometry.WallMotion.from_recording(recording), 0.5 * STEP), recording.time
     flux = [
-        float(OpeningFlow(recording.grid, mask, sampler.at(float(t)), LEAK).rate(field))
+        float(OpeningFlow(recording.grid, mask, sampler.at(float(t)), LEAK, [OPENING]).rate(field))
         for t, mask, field in zip(time, recording.mask, recording.velocity, strict=True)
     ]
     return float(np.trapezoid(flux, time) / (body.volume(time[-1]) - body.volume(time[0])))

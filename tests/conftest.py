@@ -18,10 +18,13 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 
 def _prefer_installed() -> None:
-    """Test what was installed: `python -m pytest` puts the checkout first, which has no compiled kernels."""
+    """Test what was installed: `python -m pytest` puts the checkout first, which has no compiled kernels.
+
+    It comes last, so that processes that a test starts find the test by its name.
+    """
     elsewhere = [entry for entry in sys.path if Path(entry or os.getcwd()).resolve() != ROOT]
     if any(metadata.distributions(name="torchsph", path=elsewhere)):
-        sys.path[:] = elsewhere
+        sys.path[:] = [*elsewhere, str(ROOT)]
 
 
 _prefer_installed()

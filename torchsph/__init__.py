@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from .simulator.seeding import Seeding
     from .simulator.simulation import Simulation
     from .simulator.simulator import Simulator
+    from .simulator.transfer.particle_series import ParticleSeries
 
 __version__ = "0.1.0"  # the one place: pyproject.toml reads it from here, without importing
 
@@ -61,6 +62,7 @@ __all__ = [
     "MethodResult",
     "NumericalFailure",
     "ObservationError",
+    "ParticleSeries",
     "PopulationControl",
     "PotentialWall",
     "PressureSource",
@@ -171,6 +173,7 @@ _HOMES = {
     "simulator.seeding": ("Seeding",),
     "simulator.simulation": ("Simulation",),
     "simulator.simulator": ("Simulator",),
+    "simulator.transfer.particle_series": ("ParticleSeries",),
 }
 
 _ROOMS = (

@@ -6,7 +6,8 @@ from .field_map import FieldMap, read_field_map
 from .labelled_arrays import from_xarray, to_xarray
 from .registry import FORMATS, Format
 from .source import FormatError
-from .writers.vtkhdf import PolySeries, write_sidecar
+from .writers.sidecar import write_sidecar
+from .writers.vtkhdf import PolySeries
 
 __all__ = [
     "EXPORTS",

@@ -10,20 +10,18 @@ import h5py
 import numpy as np
 
 from geometry.grids.grid import Grid
-from geometry.recordings.field_checks import FACTOR, best_order
 from geometry.recordings.read import read_recording
-from geometry.recordings.recording import Recording, Wall
+from geometry.recordings.recording import Recording
 from geometry.recordings.units import factor
 from geometry.surfaces.files import SUFFIXES
 
 from .assemble import Fields, assemble
+from .axis_order import in_best_order
 from .field_map import FieldMap
 from .readers.hdf5 import text
 from .registry import open_source
 from .source import FormatError, Source
 from .walls import inside_at, wall_from_files, wall_from_mask
-
-ORDERS = ("zyx", "xyz", "yxz", "zxy", "xzy", "yzx")
 
 
 @dataclass(frozen=True)
@@ -149,28 +147,7 @@ def _timeless(source: Source) -> bool:
 
 def _ordered(source: Source, said: FieldMap) -> Fields:
     """Assembled; with `axes="auto"` in the order of axes that has the least divergence."""
-    if said.axes != "auto":
-        return assemble(source, said)
-    # Spacings belong to x, y, z, so that each order is another field: all are tried, and only their scores kept.
-    scores = {axes: _divergence(source, replace(said, axes=axes)) for axes in ORDERS}
-    axes = min(scores, key=lambda one: scores[one])
-    if scores["zyx"] <= FACTOR * scores[axes]:
-        axes = "zyx"
-    fields = assemble(source, replace(said, axes=axes))
-    rest = ", ".join(f"{one} {score:.2g}" for one, score in scores.items() if one != axes)
-    fields.notes.append(f"axes taken as {axes}: divergence {scores[axes]:.2g} of the gradient ({rest})")
-    return fields
-
-
-def _divergence(source: Source, said: FieldMap) -> float:
-    """The RMS of the divergence relative to that of the gradient."""
-    fields = assemble(source, said)
-    mask = fields.mask if fields.mask is not None else np.isfinite(fields.velocity).all(axis=1)
-    bare = Wall(np.eye(4, 3), np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]]), np.zeros(4))
-    found = best_order(Recording(fields.time, fields.grid, np.nan_to_num(fields.velocity), mask, bare, 1060.0, 0.0))
-    if found is None:
-        raise FormatError(f"{source.path}: too little is measured to find the order of axes; say it (--axes zyx)")
-    return found[1]
+    return in_best_order(source, said) if said.axes == "auto" else assemble(source, said)
 
 
 def _merged(sources: Sequence[Source], said: FieldMap) -> Source | None:

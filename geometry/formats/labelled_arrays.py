@@ -28,6 +28,7 @@ ATTRIBUTES = {
     "sigma": {"units": "m s-1", "long_name": "standard deviation of the velocity"},
     "beam": {"units": "1", "long_name": "unit vector along the beam"},
     "pressure": {"units": "Pa", "long_name": "pressure"},
+    "pressure_sigma": {"units": "Pa", "long_name": "standard deviation of the pressure"},
     "wall_vertices": {"units": "m"},
     "wall_velocity": {"units": "m s-1"},
     "wall_sigma": {"units": "m", "long_name": "standard deviation of a vertex's place"},

@@ -27,6 +27,7 @@ from torch import Tensor
 from geometry.grids.grid import Grid
 from geometry.surfaces.distance import distance_and_closest
 
+from .key_times import KeyTimes
 from .wall_motion import WallMotion
 
 
@@ -69,10 +70,19 @@ class WallField:
 class MovingDistance:
     """The signed distance grid of a moving wall.
 
-    `grid`: where the distance is kept; it must cover the wall at all times, with a margin of a few nodes if
-    particles may leave. `band` (m): where it is exact (see `signed_distance`); `travel`: where a vertex moves
-    by more than that many spacings between two key frames, grids are added between them; `keep`: how many
-    grids are held in memory.
+    Args:
+        grid: where the distance is kept; it must cover the wall at all times, with a margin of a few nodes if particles
+            may leave.
+        motion: the wall.
+        band: m; where it is exact (see `signed_distance`).
+        travel: where a vertex moves by more than that many spacings between two key frames, grids are added between
+            them; inf: none are. Key frames that a straight path passes are left out (`KeyTimes`).
+        keep: how many grids are held in memory.
+        dtype: of the grids.
+        device: of the grids.
+
+    Raises:
+        ValueError: grid and wall differ in dimension, or an option is out of its bounds.
     """
 
     def __init__(
@@ -92,12 +102,8 @@ class MovingDistance:
             raise ValueError(f"MovingDistance: travel must be > 0 and keep >= 2, not {travel} and {keep}")
         self.grid, self.motion, self.band, self.keep = grid, motion, band, keep
         self.dtype, self.device = dtype, torch.device(device)
-        self._pieces = [1] * max(len(motion.time) - 1, 1)
-        if motion.moves:
-            limit = travel * min(grid.spacing)
-            ways = [motion.travel(key) for key in range(len(self._pieces))]
-            self._pieces = [max(1, int(np.ceil(way / limit - 1e-9))) for way in ways]
-        self._tables: OrderedDict[tuple[int, int], Tensor] = OrderedDict()
+        self.key_times = KeyTimes(motion, min(grid.spacing), longest_path=travel)
+        self._tables: OrderedDict[int, Tensor] = OrderedDict()
         self._current: tuple[float, WallField] | None = None
 
     def at(self, t: float) -> WallField:
@@ -119,27 +125,20 @@ class MovingDistance:
         return self.at(t).at(points).velocity
 
     def _blend(self, t: float) -> Tensor:
-        key, place, _ = self.motion.locate(t)
-        if not self.motion.moves:
-            return self._table(0, 0)
-        scaled = place * self._pieces[key]
-        piece = min(int(scaled), self._pieces[key] - 1)
-        return torch.lerp(self._table(key, piece), self._table(key, piece + 1), scaled - piece)
+        early, late, start, stop = self.key_times.bracket(t)
+        if early == late:
+            return self._table(early)
+        part = min(max((t - start) / (stop - start), 0.0), 1.0)
+        return torch.lerp(self._table(early), self._table(late), part)
 
-    def _table(self, key: int, piece: int) -> Tensor:
-        if self.motion.moves and piece == self._pieces[key]:
-            key, piece = key + 1, 0
-        name = (key, piece)
-        if name in self._tables:
-            self._tables.move_to_end(name)
-            return self._tables[name]
-        time = float(self.motion.time[key])
-        if piece:
-            time += piece / self._pieces[key] * float(self.motion.time[key + 1] - self.motion.time[key])
-        self._tables[name] = self._make(time)
+    def _table(self, number: int) -> Tensor:
+        if number in self._tables:
+            self._tables.move_to_end(number)
+            return self._tables[number]
+        self._tables[number] = self._make(self.key_times.times[number])
         while len(self._tables) > self.keep:
             self._tables.popitem(last=False)
-        return self._tables[name]
+        return self._tables[number]
 
     def _make(self, time: float) -> Tensor:
         surface = self.motion.surface(time)

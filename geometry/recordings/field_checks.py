@@ -42,7 +42,7 @@ def best_order(recording: Recording) -> tuple[str, float, float] | None:
     """
     if recording.dimension != 3 or recording.beam is not None:
         return None
-    products = _derivative_products(recording)
+    products = derivative_products(recording.velocity, measured_nodes(recording), recording.grid.spacing)
     if products is None:
         return None
     total = float(np.einsum("caca->", products))
@@ -60,29 +60,37 @@ def best_order(recording: Recording) -> tuple[str, float, float] | None:
     return words, claimed, scores[order, signs]
 
 
-def _derivative_products(recording: Recording) -> np.ndarray | None:
-    """Mean products `(3, 3, 3, 3)` of the derivatives of component c along axis a, at nodes inside."""
-    measured, count = measured_nodes(recording), 0
-    spacing = recording.grid.spacing
-    products = np.zeros((3, 3, 3, 3))
-    if min(recording.grid.shape) < 3:
+def derivative_products(velocity: np.ndarray, measured: np.ndarray, spacing: tuple[float, ...]) -> np.ndarray | None:
+    """Mean products `(3, 3, 3, 3)` of the derivatives of component c along axis a, at nodes inside.
+
+    Args:
+        velocity: (T, 3, nz, ny, nx), of which some frames are taken.
+        measured: (T, nz, ny, nx), bool.
+        spacing: along x, y, z.
+
+    Returns:
+        Indexed [c, a, d, b]; None where too little is measured.
+    """
+    count, products = 0, np.zeros((3, 3, 3, 3))
+    if min(measured.shape[1:]) < 3:
         return None
-    for frame in sampled(recording.frames, FRAMES):
+    for frame in sampled(len(measured), FRAMES):
         inner = measured[frame][1:-1, 1:-1, 1:-1].copy()
         for axis in range(3):
             for step in (0, 2):
                 window = [slice(1, -1)] * 3
                 window[axis] = slice(step, step - 2 or None)
                 inner &= measured[frame][tuple(window)]
-        velocity = recording.velocity[frame].astype(np.float64)
         rows = np.empty((3, 3, int(inner.sum())))
         for axis in range(3):
             window = [slice(1, -1)] * 3
             ahead, behind = list(window), list(window)
             array_axis = 2 - axis
             ahead[array_axis], behind[array_axis] = slice(2, None), slice(0, -2)
-            slope = (velocity[(slice(None), *ahead)] - velocity[(slice(None), *behind)]) / (2 * spacing[axis])
-            rows[:, axis] = slope[:, inner]
+            for component in range(3):
+                field = velocity[frame, component]
+                change = field[tuple(ahead)][inner].astype(np.float64) - field[tuple(behind)][inner]
+                rows[component, axis] = change / (2 * spacing[axis])
         products += np.einsum("can,dbn->cadb", rows, rows)
         count += rows.shape[2]
     return products / count if count >= LEAST_NODES else None

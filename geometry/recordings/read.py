@@ -30,6 +30,7 @@ QUANTITIES = {
     "/velocity": "velocity",
     "/sigma": "velocity",
     "/pressure": "pressure",
+    "/pressure_sigma": "pressure",
     "/wall/vertices": "length",
     "/wall/velocity": "velocity",
     "/wall/sigma": "length",

@@ -31,6 +31,7 @@ LAYOUT: tuple[tuple[str, str, type], ...] = (
     ("quality", "/quality", np.uint8),
     ("beam", "/beam", np.float32),
     ("pressure", "/pressure", np.float32),
+    ("pressure_sigma", "/pressure_sigma", np.float32),
     ("wall.vertices", "/wall/vertices", np.float64),
     ("wall.faces", "/wall/faces", np.int32),
     ("wall.region", "/wall/region", np.uint8),
@@ -109,6 +110,7 @@ class Recording:
         quality: (T, *shape), codes of `Quality`: why an analysis is what it is at each node.
         beam: (T, D, *shape) or (D, *shape), unit vectors along which alone the velocity was measured.
         pressure: (T, *shape), Pa, gauge.
+        pressure_sigma: (T, *shape), Pa, standard deviation of the pressure.
         valve_intervals: (n, 3), rows (region, opens, closes), s.
         valve_leak: (n, 2), rows (region, part of its area that stays open while it is shut).
         valve_open: (T, 2), regions 1 and 2 open at the frames; used where there are no intervals.
@@ -136,6 +138,7 @@ class Recording:
     quality: np.ndarray | None = None
     beam: np.ndarray | None = None
     pressure: np.ndarray | None = None
+    pressure_sigma: np.ndarray | None = None
     valve_intervals: np.ndarray | None = None
     valve_leak: np.ndarray | None = None
     valve_open: np.ndarray | None = None
@@ -204,8 +207,11 @@ class Recording:
         """Some of the frames, in increasing order of time: a slice, frame numbers or a bool for each frame.
 
         The period stays what it is: frames left out do not change the motion that they sample.
+
+        Raises:
+            ValueError: there are no such frames, or none is left.
         """
-        chosen = np.arange(self.frames)[frames if isinstance(frames, slice) else np.asarray(frames)]
+        chosen = _numbers(frames, self.frames)
         changes: dict[str, Any] = {"wall": None if self.wall is None else self.wall.select(chosen)}
         changes["fluxes"] = tuple(flux.select(chosen) for flux in self.fluxes)
         for name, _, _ in LAYOUT:
@@ -230,7 +236,8 @@ class Recording:
 
         What belonged to the old velocity (weight, sigma, quality, beam, pressure, fluxes) is dropped.
         """
-        gone: dict[str, Any] = dict.fromkeys(("weight", "beam", "pressure", "flux_mitral", "flux_aortic"))
+        gone: dict[str, Any] = dict.fromkeys(("weight", "beam", "pressure", "pressure_sigma"))
+        gone |= dict.fromkeys(("flux_mitral", "flux_aortic"))
         text = self.description if description is None else description
         new: dict[str, Any] = {"velocity": velocity, "sigma": sigma, "uncovered": uncovered, "quality": quality}
         return replace(self, **new, description=text, fluxes=(), **gone)
@@ -270,6 +277,18 @@ def _coerce(instance: Wall | Recording, prefix: str) -> None:
             object.__setattr__(instance, item.name, array)
 
 
+def _numbers(frames: slice | Sequence[int] | np.ndarray, count: int) -> np.ndarray:
+    """Frame numbers (n,) that a slice, numbers or bools stand for, of ``count`` frames."""
+    if isinstance(frames, slice):
+        return np.arange(count)[frames]
+    asked = np.asarray(frames)
+    numbers = asked.dtype.kind in "iu" and bool(((asked >= -count) & (asked < count)).all())
+    if asked.ndim != 1 or not (numbers or (asked.dtype.kind == "b" and len(asked) == count)):
+        what = f"{asked.dtype} of the shape {asked.shape}" if asked.dtype.kind not in "iu" else f"numbers {frames}"
+        raise ValueError(f"frames must be a slice, numbers from 0 to {count - 1} or {count} bools, not {what}")
+    return np.arange(count)[asked]
+
+
 def _check_shapes(recording: Recording) -> None:
     """Ranks and sizes that must agree: time, grid, wall and valves against each other."""
     source, arrays = "recording", recording.arrays()
@@ -295,6 +314,7 @@ def _allowed_shapes(recording: Recording) -> dict[str, tuple[tuple[int, ...], ..
         "/quality": ((frames, *shape),),
         "/beam": ((frames, dimension, *shape), (dimension, *shape)),
         "/pressure": ((frames, *shape),),
+        "/pressure_sigma": ((frames, *shape),),
         **({} if recording.wall is None else _allowed_wall_shapes(recording.wall, frames, dimension)),
         "/valve/intervals": ((len(intervals) if intervals is not None and intervals.ndim else 0, 3),),
         "/valve/leak": ((len(leak) if leak is not None and leak.ndim else 0, 2),),

@@ -125,11 +125,11 @@ def _weight(recording: Recording, source: str) -> None:
 
 def _finite(recording: Recording, source: str) -> None:
     measured, components = measured_nodes(recording), -1 - recording.dimension
-    for dataset in ("/velocity", "/sigma", "/beam", "/pressure"):
+    for dataset in ("/velocity", "/sigma", "/beam", "/pressure", "/pressure_sigma"):
         field = recording.arrays().get(dataset)
         if field is None:
             continue
-        finite = np.isfinite(field) if dataset == "/pressure" else np.isfinite(field).all(axis=components)
+        finite = np.isfinite(field) if dataset.startswith("/pressure") else np.isfinite(field).all(axis=components)
         bad = measured & ~finite
         if bad.any():
             rule = f"must be finite inside the mask, but is not at {int(bad.sum())} nodes, as at {_first(bad)}"

@@ -87,6 +87,9 @@ class VectorRows(PointRows):
     def __init__(self, knots: Knots, points: torch.Tensor, target: torch.Tensor, weight: torch.Tensor) -> None:
         if target.ndim != 2 or len(target) != len(points):
             raise InvalidInput(f"target has the shape {tuple(target.shape)}: it must be ({len(points)}, C)")
+        if tuple(weight.shape) not in {(), (1,), (len(target), 1), tuple(target.shape)}:
+            rule = f"it must be ({len(target)}, 1) or {tuple(target.shape)}"
+            raise InvalidInput(f"weight has the shape {tuple(weight.shape)}: {rule}")
         super().__init__(knots, points, target.shape[1])
         self.weight = weight.expand(target.shape)
         self.target = (self.weight * target).flatten()

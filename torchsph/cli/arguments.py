@@ -48,6 +48,13 @@ def add_output_folder(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", default=OUT, metavar="DIR", help="folder of the results (%(default)s)")
 
 
+def add_sidecar(parser: argparse.ArgumentParser) -> None:
+    """Whether viewers get files of their own beside each analysis."""
+    parser.add_argument(
+        "--no-sidecar", action="store_true", help="write no NAME.vtkhdf, by which ParaView opens NAME.h5, beside it"
+    )
+
+
 # --- values ----------------------------------------------------------------------------------------
 
 

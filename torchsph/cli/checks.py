@@ -22,11 +22,10 @@ def full_vectors(recording: geometry.Recording, path: str | Path) -> geometry.Re
     return recording
 
 
-def informative(recording: geometry.Recording, path: str | Path, *, weighed: bool = True) -> geometry.Recording:
-    """The recording, refused by its path where nothing was measured or, if it is `weighed`, an error is stated as 0."""
+def informative(recording: geometry.Recording, path: str | Path) -> geometry.Recording:
+    """The recording, refused by its path where nothing was measured or an error is stated as 0."""
     refuse_silent(recording, str(path))
-    if weighed:
-        refuse_exact(recording, str(path))
+    refuse_exact(recording, str(path))
     return recording
 
 

@@ -8,16 +8,18 @@ import math
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from geometry.recordings.whole_file import move_together, refuse_special, write_whole
+import geometry
+from geometry.formats import write_sidecar
+from geometry.recordings.whole_file import move_together, refuse_special, write_whole, written_together
 
-__all__ = ["output_folder", "staged", "write_json"]
+__all__ = ["output_folder", "staged", "write_analysis", "write_json"]
 
 _SCRATCH = ".torchsph-"
 
@@ -65,6 +67,31 @@ def staged(folder: str | Path) -> Iterator[Path]:
         os.close(lock)
         with suppress(OSError):  # the folder holds files already: the usual case, and then it stays
             folder.rmdir()
+
+
+def write_analysis(
+    path: str | Path, recording: geometry.Recording, account: Mapping[str, object], *, sidecar: bool
+) -> None:
+    """Write a result, with the files by which viewers open it beside it: all of them or none.
+
+    Args:
+        path: of the recording.
+        recording: the result.
+        account: where it comes from.
+        sidecar: whether viewers get files.
+    """
+    path = Path(path)
+    if not sidecar:
+        geometry.write_recording(path, recording, provenance=account)
+        return
+    for beside in ("", "_wall"):
+        refuse_special(path.with_name(f"{path.stem}{beside}.vtkhdf"))
+    try:
+        with written_together(path.parent) as scratch:
+            geometry.write_recording(scratch / path.name, recording, provenance=account)
+            write_sidecar(scratch / path.name, recording)
+    except geometry.RecordingError as fault:  # of the file that is wanted, not of the one on the way to it
+        raise geometry.RecordingError(str(path), fault.dataset, fault.rule) from fault
 
 
 def _locked_scratch(folder: Path) -> tuple[Path, int]:

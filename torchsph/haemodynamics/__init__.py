@@ -24,7 +24,7 @@ from .lagrangian.flow_components import FlowComponents, flow_components
 from .lagrangian.moving_flow import MovingFlow, MovingWalls
 from .lagrangian.tracers import Tracers, carry, residence_time, seed_blood
 from .pressure import PressureSolver, pressure_difference, region_mean
-from .quantities import UNITS, FlowDomain, flow_quantities, long_axis
+from .quantities import UNITS, FieldQuantities, FlowDomain, FrameQuantities, flow_quantities, long_axis
 from .uncertainty import RunningMoments, Summary, around, coverage, summary
 from .vortices import PlaneVortex, VortexRing, main_vortex, vortex_cores, vortex_ring
 from .vorticity import helicity_density, lambda2, q_criterion, vorticity
@@ -34,9 +34,11 @@ __all__ = [
     "BEAT_UNITS",
     "UNITS",
     "Derivatives",
+    "FieldQuantities",
     "FillingPeaks",
     "FlowComponents",
     "FlowDomain",
+    "FrameQuantities",
     "MovingFlow",
     "MovingWalls",
     "OpeningFlow",

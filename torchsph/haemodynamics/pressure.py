@@ -41,13 +41,14 @@ class PressureSolver:
     Args:
         grid: the nodes.
         mask: bool `(*shape)`.
+        tolerance: of the residual, relative.
 
     Raises:
         ValueError: the mask does not lie on the grid or has no node.
     """
 
-    def __init__(self, grid: geometry.Grid, mask: ArrayLike) -> None:
-        self.grid, self.mask = grid, np.asarray(mask, bool)
+    def __init__(self, grid: geometry.Grid, mask: ArrayLike, tolerance: float = TOLERANCE) -> None:
+        self.grid, self.mask, self.tolerance = grid, np.asarray(mask, bool), tolerance
         if self.mask.shape != grid.shape:
             raise ValueError(f"PressureSolver: the mask must be {grid.shape} as the grid, not {self.mask.shape}")
         if not self.mask.any():
@@ -123,7 +124,7 @@ class PressureSolver:
         diagonal = matrix.diagonal()
         inverse = np.where(diagonal > 0, 1 / np.where(diagonal > 0, diagonal, 1.0), 0.0)[:, None]
         solution, residual = np.zeros_like(right), self._without_means(right)
-        goal = TOLERANCE * np.linalg.norm(residual, axis=0)
+        goal = self.tolerance * np.linalg.norm(residual, axis=0)
         direction = conditioned = inverse * residual
         energy = (residual * conditioned).sum(0)
         for _ in range(10 * len(self.nodes) + 10):

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -22,7 +23,7 @@ from .force import axial_components, haemodynamic_force
 from .pressure import PressureSolver, pressure_difference
 from .vorticity import helicity_density, vorticity
 
-__all__ = ["UNITS", "FlowDomain", "flow_quantities", "long_axis"]
+__all__ = ["UNITS", "FieldQuantities", "FlowDomain", "FrameQuantities", "flow_quantities", "long_axis"]
 
 Array = NDArray[np.float64]
 
@@ -43,6 +44,24 @@ UNITS = {
 
 PROBE = 2.0
 """The pressure at base and apex is the mean within this many spacings of a point as far inside on the long axis."""
+
+
+PRECISION = 1e-8
+"""Of the pressure's equations, relative: far below what any field is known to."""
+
+
+class FieldQuantities(NamedTuple):
+    """What is read out of fields of one frame.
+
+    Attributes:
+        curves: every quantity of `UNITS`, `(*batch)`.
+        pressure: `(*batch, *shape)`, Pa, of mean 0 over each part of the mask.
+        vorticity: `(*batch, D, *shape)`, 1/s.
+    """
+
+    curves: dict[str, Array]
+    pressure: Array
+    vorticity: Array
 
 
 @dataclass(frozen=True)
@@ -135,54 +154,90 @@ def flow_quantities(
         )
     sampler = geometry.WallSampler(domain.motion, min(domain.grid.spacing))
     deviations = [None] * frames if sigma is None else list(np.nan_to_num(np.asarray(sigma, np.float64)))
-    rows = [_frame(domain, velocity, n, sampler, deviations[n], order) for n in range(frames)]
+    rows = []
+    for n in range(frames):
+        near = list(range(max(n - order, 0), min(n + order + 1, frames)))
+        fields, place = _frames_of(velocity, near), n - near[0]
+        rate = time_derivative(fields, domain.mask[near], domain.time[near], place, order=order, events=domain.events)
+        rows.append(FrameQuantities(domain, n, sampler).of(fields[place], rate, sigma=deviations[n])[0])
     return {name: np.stack([row[name] for row in rows], axis=-1) for name in UNITS}
 
 
-def _frame(
-    domain: FlowDomain,
-    velocity: NDArray[np.floating],
-    number: int,
-    sampler: geometry.WallSampler,
-    sigma: Array | None,
-    order: int,
-) -> dict[str, Array]:
-    t, mask, grid = float(domain.time[number]), domain.mask[number], domain.grid
-    surface = domain.motion.surface(t)
-    near = range(max(number - order, 0), min(number + order + 1, len(domain.time)))
-    fields = _frames_of(velocity, near)
-    speed = fields[number - near[0]]
-    volume, cell = surface.volume, grid.cell_volume
-    walled, free = Derivatives(grid, mask, WallSamples.at(sampler, t)), Derivatives(grid, mask)
-    gradient = walled.gradient(speed)
-    curl = vorticity(gradient)
-    rate = time_derivative(
-        fields, domain.mask[list(near)], domain.time[list(near)], number - near[0], order=order, events=domain.events
-    )
-    acceleration = material_acceleration(speed, free.gradient(speed), rate)
-    slope = pressure_gradient(acceleration, free.laplacian(speed), domain.rho, domain.mu)
-    base, apex = long_axis(surface)
-    axis = (base - apex) / np.linalg.norm(base - apex)
-    probe = PROBE * min(grid.spacing)
-    pressure = PressureSolver(grid, mask).solve(slope)
-    force = haemodynamic_force(acceleration, mask, cell, domain.rho, volume=volume)
-    along, across = axial_components(force, axis)
-    energy = kinetic_energy(speed, mask, cell, domain.rho, sigma=sigma, volume=volume)
-    flows = _flows(domain, speed, mask, sampler.at(t), t)
-    return {
-        "volume": np.broadcast_to(volume, np.shape(energy)),
-        "kinetic_energy": energy,
-        "kinetic_energy_density": energy / volume,
-        "energy_loss": energy_loss(gradient, mask, cell, domain.mu, volume=volume),
-        "vorticity_rms": np.sqrt(integral((curl**2).sum(-4), mask, cell, 1.0)),
-        "helicity": integral(helicity_density(speed, curl), mask, cell, 1.0),
-        "force_axial": along,
-        "force_across": across,
-        "pressure_difference": pressure_difference(
-            pressure, mask, grid, base - probe * axis, apex + probe * axis, probe
-        ),
-        **flows,
-    }
+class FrameQuantities:
+    """The quantities of one frame, for any number of fields.
+
+    Args:
+        domain: masks, walls and fluid.
+        number: of the frame.
+        sampler: of the domain's walls, made once for all frames; `None`: one of its own.
+    """
+
+    def __init__(self, domain: FlowDomain, number: int, sampler: geometry.WallSampler | None = None) -> None:
+        walls = geometry.WallSampler(domain.motion, min(domain.grid.spacing)) if sampler is None else sampler
+        self.domain, self.time, self.mask = domain, float(domain.time[number]), domain.mask[number]
+        grid, surface = domain.grid, domain.motion.surface(self.time)
+        self.volume = surface.volume
+        self.base, self.apex = long_axis(surface)
+        self._walled = Derivatives(grid, self.mask, WallSamples.at(walls, self.time))
+        self._free = Derivatives(grid, self.mask)
+        self._solver = PressureSolver(grid, self.mask, PRECISION)
+        self._openings = self._open_orifices(walls.at(self.time))
+
+    def of(self, velocity: ArrayLike, rate: ArrayLike | None, *, sigma: ArrayLike | None = None) -> FieldQuantities:
+        """Every quantity of `UNITS` `(*batch)`, and the relative pressure.
+
+        Args:
+            velocity: `(*batch, D, *shape)`, m/s, finite.
+            rate: du/dt like it, m/s^2; `None` for a steady flow.
+            sigma: standard deviation of each component `(D, *shape)`, m/s, for the kinetic energy.
+        """
+        domain, mask, speed = self.domain, self.mask, np.asarray(velocity, np.float64)
+        cell, volume = domain.grid.cell_volume, self.volume
+        gradient = self._walled.gradient(speed)
+        curl = vorticity(gradient)
+        acceleration = material_acceleration(speed, self._free.gradient(speed), rate)
+        slope = pressure_gradient(acceleration, self._free.laplacian(speed), domain.rho, domain.mu)
+        pressure = self._solver.solve(slope)
+        force = haemodynamic_force(acceleration, mask, cell, domain.rho, volume=volume)
+        along, across = axial_components(force, self.axis)
+        energy = kinetic_energy(speed, mask, cell, domain.rho, sigma=sigma, volume=volume)
+        curves = {
+            "volume": np.broadcast_to(volume, np.shape(energy)),
+            "kinetic_energy": energy,
+            "kinetic_energy_density": energy / volume,
+            "energy_loss": energy_loss(gradient, mask, cell, domain.mu, volume=volume),
+            "vorticity_rms": np.sqrt(integral((curl**2).sum(-4), mask, cell, 1.0)),
+            "helicity": integral(helicity_density(speed, curl), mask, cell, 1.0),
+            "force_axial": along,
+            "force_across": across,
+            "pressure_difference": self.pressure_difference(pressure),
+        }
+        for name in ("flow_inlet", "flow_outlet"):
+            sign, opening = self._openings.get(name, (0.0, None))
+            curves[name] = np.zeros(np.shape(energy)) if opening is None else sign * opening.rate(speed)
+        return FieldQuantities(curves, pressure, curl)
+
+    @property
+    def axis(self) -> Array:
+        """Unit vector from apex to base."""
+        return np.asarray((self.base - self.apex) / np.linalg.norm(self.base - self.apex), np.float64)
+
+    def pressure_difference(self, pressure: ArrayLike) -> Array:
+        """Base less apex `(*batch)`, Pa, of a pressure `(*batch, *shape)`, Pa."""
+        probe = PROBE * min(self.domain.grid.spacing)
+        upper, lower = self.base - probe * self.axis, self.apex + probe * self.axis
+        return pressure_difference(pressure, self.mask, self.domain.grid, upper, lower, probe)
+
+    def _open_orifices(self, wall: geometry.WallPoints) -> dict[str, tuple[float, OpeningFlow]]:
+        """Inlet and outlet where they are open, and the sign of their valve's own direction."""
+        domain, found = self.domain, {}
+        there = [int(label) for label in np.unique(wall.region[wall.region > 0])]
+        passing = [label for label in there if domain.is_open(label, self.time)]
+        for name, region, sign in (("flow_inlet", domain.inlet, 1.0), ("flow_outlet", domain.outlet, -1.0)):
+            if region in passing:
+                others = [label for label in passing if label != region]
+                found[name] = (sign, OpeningFlow(domain.grid, self.mask, wall, region, others))
+        return found
 
 
 def _frames_of(velocity: NDArray[np.floating], frames: Sequence[int]) -> Array:
@@ -192,15 +247,3 @@ def _frames_of(velocity: NDArray[np.floating], frames: Sequence[int]) -> Array:
     chosen = velocity[:, part] if len(shape) == 6 else velocity[part]
     array = np.nan_to_num(np.asarray(chosen, np.float64), posinf=0.0, neginf=0.0)
     return np.moveaxis(array, 1, 0) if len(shape) == 6 else array
-
-
-def _flows(
-    domain: FlowDomain, velocity: Array, mask: NDArray[np.bool_], wall: geometry.WallPoints, t: float
-) -> dict[str, Array]:
-    """Flow through inlet and outlet, each in its valve's direction; 0 through a valve that is shut."""
-    nothing = np.zeros(velocity.shape[: -1 - domain.grid.dimension])
-    found = {}
-    for name, region, sign in (("flow_inlet", domain.inlet, 1.0), ("flow_outlet", domain.outlet, -1.0)):
-        there = domain.is_open(region, t) and bool((wall.region == region).any())
-        found[name] = sign * OpeningFlow(domain.grid, mask, wall, region).rate(velocity) if there else nothing
-    return found

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import os
 import time as clock
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -22,9 +21,13 @@ from .ensemble.options import EnsembleOptions
 from .forecast_skill import ForecastSkill, skill
 from .free_run import run_freely
 from .measurement.prepared import PreparedMeasurement
+from .members.draws import spline_frames
+from .members.frames import FrameObserver
+from .members.kept import MemberFile
+from .members.quantities import MemberCurves, MemberQuantities, quantified, with_pressure
 from .memory import MemoryPrediction, free_memory, predicted
 from .nudging import filter_sph
-from .runtime import checkpoint
+from .runtime.checkpoint import Saved
 from .runtime.parallel import from_last, is_last, is_lead
 from .runtime.watching import Watcher
 
@@ -38,6 +41,8 @@ DEFAULT_MEMBERS = 16
 # particle spacing in grid spacings of the single runs and of the ensemble's members; its control run takes half of it
 ANALYSIS_SPACING = 2.0
 CONTROL_SHARE = 0.5
+# of a recording's frames, what forecasts from them hold at once beside those that are saved
+FORECAST_COPIES = 2
 
 # Between frames that correct it, coarser particles resolve less in time as well: in a human ventricle with 3 and 6 mm,
 # steps of up to 0.7 spacings per m/s leave the ensemble's error as it is (.410, .409 with 0.7 ms) at 0.64 times the
@@ -47,11 +52,12 @@ LONG_STEPS: dict[str, Any] = {"max_step": None, "longest_step": 0.7}
 
 @dataclass(frozen=True)
 class MethodResult:
-    """What one method made of a measurement."""
+    """What one method made of a measurement, and where they were asked for the quantities of all its members."""
 
     recording: geometry.Recording
     seconds: float
     info: dict[str, Any] = field(default_factory=dict)
+    quantities: MemberCurves | None = None
 
 
 def make_model(
@@ -93,11 +99,13 @@ def run_methods(
     lag: int | None = None,
     minimum_members: int | None = None,
     checkpoints: str | Path | None = None,
-    resume: bool = False,
+    resume: bool | Saved = False,
     watcher: Watcher | None = None,
     seed: int = 0,
     device: str = "cpu",
     progress: bool = False,
+    quantities: Collection[str] = (),
+    keep_members: Path | None = None,
 ) -> dict[str, MethodResult]:
     """Run methods by name on one measurement, in the order of ``METHODS``.
 
@@ -105,7 +113,9 @@ def run_methods(
     defaults to ``ANALYSIS_SPACING`` grid spacings, half of it in the ensemble's control run; ``members`` to
     ``DEFAULT_MEMBERS``. ``also``, ``truth``, ``lag``, ``minimum_members``, ``checkpoints``, ``resume`` and ``watcher``
     are the ensemble's (``assimilate``, ``EnsembleOptions``); the other methods know one measurement. The seconds of a
-    method include the spline that it starts from only where "spline" itself was not asked for.
+    method include the spline that it starts from only where "spline" itself was not asked for. ``quantities`` names the
+    methods whose members are read out ("ensemble", and "spline" by as many draws as members); ``keep_members`` is the
+    file to which the ensemble's are written.
 
     Under torchrun all processes share the splines and the ensemble; the first one runs "sph" meanwhile and the last
     one "free". What the first one returns is complete.
@@ -124,6 +134,8 @@ def run_methods(
     predicted_memory(prepared, methods, preset, models.spacing, count, also).refuse_beyond(free_memory())
     ensemble = None
     if "ensemble" in methods:
+        if resume is True and checkpoints is not None and is_lead():
+            resume = Saved.read(Path(checkpoints)) or True
         ensemble = _EnsembleCall(
             prepared,
             models,
@@ -134,14 +146,16 @@ def run_methods(
             checkpoints=None if checkpoints is None else Path(checkpoints),
             resume=resume,
             seed=seed,
+            quantities="ensemble" in quantities,
+            keep_members=keep_members,
         )
         ensemble.refuse_foreign_checkpoint()
     smoothed = prepared.smoothed  # by all processes together
-    found = prepared.splines.estimates.summary()
-    mended = {"estimates": found} if found else {}
+    mended = {"estimates": found} if (found := prepared.splines.estimates.summary()) else {}
     results: dict[str, MethodResult] = {}
     if "spline" in methods:
-        results["spline"] = timer.result(smoothed, {"smoother": repr(smoother), **mended})
+        drawn = _drawn(prepared, count, seed) if "spline" in quantities and is_lead() else None
+        results["spline"] = timer.result(with_pressure(smoothed, drawn), {"smoother": repr(smoother)} | mended, drawn)
     if is_last() and set(methods) != {"spline"}:
         free = run_freely(measured, models.coarse, smoothed.velocity[0], seed=seed, progress=progress)
         results["free"] = timer.result(free)
@@ -149,8 +163,8 @@ def run_methods(
         run = filter_sph(prepared, models.coarse, seed=seed, progress=progress)
         results["sph"] = timer.result(run.recording, run.info)
     if ensemble is not None:
-        done = ensemble.run(watcher, progress)
-        results["ensemble"] = timer.result(done.recording, done.info | mended)
+        done, curves = ensemble.run(watcher, progress)
+        results["ensemble"] = timer.result(with_pressure(done.recording, curves), done.info | mended, curves)
     return _collected(results)
 
 
@@ -169,12 +183,22 @@ def predicted_memory(
     if "ensemble" in methods:
         runs = [(spacing, min(members, EnsembleOptions().batch)), (CONTROL_SHARE * spacing, 1)]
     return predicted(
-        prepared,
+        prepared.recording,
         scheme_preset(preset),
+        splines=prepared.splines,
         spacings=runs,
         members=members if "ensemble" in methods else 0,
         further=also,
     )
+
+
+def predicted_forecast_memory(
+    recording: geometry.Recording, saved: Sequence[float] = (), preset: str = "default", spacing: float | None = None
+) -> MemoryPrediction:
+    """What ``forecast_skill`` with the same options will take, where the forecasts at the leads ``saved`` are kept."""
+    spacing = min(recording.grid.spacing) if spacing is None else spacing
+    copies = FORECAST_COPIES + 2 * len(saved)
+    return predicted(recording, scheme_preset(preset), spacings=[(spacing, 1)], copies=copies)
 
 
 def _spacing(prepared: PreparedMeasurement, asked: float | None) -> float:
@@ -217,12 +241,14 @@ class _EnsembleCall:
     options: EnsembleOptions
     truth: geometry.Recording | None
     checkpoints: Path | None
-    resume: bool
+    resume: bool | Saved
     seed: int
+    quantities: bool = False
+    keep_members: Path | None = None
 
     def refuse_foreign_checkpoint(self) -> None:
         """Tell another run's checkpoint before splines and free runs have taken their minutes."""
-        if not self.resume or self.checkpoints is None or not is_lead() or not os.path.lexists(self.checkpoints):
+        if not isinstance(self.resume, Saved):
             return
         key = ensemble_key(
             [self.prepared, *(further(one, self.prepared) for one in self.also)],
@@ -234,11 +260,16 @@ class _EnsembleCall:
             seed=self.seed,
             truth=self.truth,
         )
-        checkpoint.refuse_foreign(self.checkpoints, key)
+        self.resume.refuse_foreign(key)
 
-    def run(self, watcher: Watcher | None, progress: bool) -> EnsembleRun:
-        """The ensemble's analyses."""
-        return assimilate(
+    def run(self, watcher: Watcher | None, progress: bool) -> tuple[EnsembleRun, MemberCurves | None]:
+        """The ensemble's analyses, and what its members give where it is asked for."""
+        read: list[FrameObserver] = []
+        if self.quantities:
+            read.append(MemberQuantities(self.prepared.recording))
+        if self.keep_members is not None:
+            read.append(MemberFile(self.keep_members, self.prepared.recording, self.members))
+        run = assimilate(
             self.prepared,
             self.models.fine,
             coarse=self.models.coarse,
@@ -251,7 +282,12 @@ class _EnsembleCall:
             watcher=watcher,
             seed=self.seed,
             progress=progress,
+            observers=read,
         )
+        if not self.quantities or not is_lead():
+            return run, None
+        curves = read[0].found() if isinstance(read[0], MemberQuantities) else None
+        return run, curves
 
 
 def _check(methods: Sequence[str], measured: geometry.Recording) -> None:
@@ -260,6 +296,12 @@ def _check(methods: Sequence[str], measured: geometry.Recording) -> None:
         raise ValueError(f"unknown method {', '.join(unknown)}; known: {', '.join(METHODS)}")
     if "sph" in methods:
         geometry.measurement_type(measured).require_full("method sph imposes")
+
+
+def _drawn(prepared: PreparedMeasurement, count: int, seed: int) -> MemberCurves:
+    """What draws from the splines' posterior give."""
+    frames = spline_frames(prepared.splines, prepared.smoothed, count, seed=seed)
+    return quantified(prepared.smoothed, frames)
 
 
 def _collected(results: dict[str, MethodResult]) -> dict[str, MethodResult]:
@@ -275,10 +317,15 @@ class _Timer:
     def __init__(self) -> None:
         self.began = clock.perf_counter()
 
-    def result(self, recording: geometry.Recording, info: dict[str, Any] | None = None) -> MethodResult:
+    def result(
+        self,
+        recording: geometry.Recording,
+        info: dict[str, Any] | None = None,
+        quantities: MemberCurves | None = None,
+    ) -> MethodResult:
         ended = clock.perf_counter()
         seconds, self.began = ended - self.began, ended
-        return MethodResult(recording, seconds, {} if info is None else info)
+        return MethodResult(recording, seconds, {} if info is None else info, quantities)
 
 
 def forecast_skill(
@@ -293,8 +340,13 @@ def forecast_skill(
     progress: bool = False,
     seed: int = 0,
 ) -> ForecastSkill:
-    """Skill of the simulator on a recording; see ``skill``. ``spacing`` (m) defaults to the grid's."""
+    """Skill of the simulator on a recording; see ``skill``. ``spacing`` (m) defaults to the grid's.
+
+    Raises:
+        NotEnoughMemory: more would be needed than is free.
+    """
     began = clock.perf_counter()
+    predicted_forecast_memory(recording, leads if save else (), preset, spacing).refuse_beyond(free_memory())
     model = make_model(recording, preset=preset, spacing=spacing, device=device)
     made = clock.perf_counter() - began
     result = skill(recording, model, leads, every=every, save=save, progress=progress, seed=seed)

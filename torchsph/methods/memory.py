@@ -22,7 +22,7 @@ from regularize.solvers.memory import band_bytes
 from torchsph.pairs.smoothing_kernels import kernel
 from torchsph.simulator.schemes.scheme import Scheme
 
-from .measurement.prepared import PreparedMeasurement
+from .measurement.frame_splines import FrameSmoother
 
 _BANDS = 4  # copies of a spline's band that live at once while its smoothness is chosen
 _PER_SAMPLE = 10_000  # bytes of rows and of errors that neighbours share
@@ -90,40 +90,43 @@ _CURES = {
 
 
 def predicted(
-    prepared: PreparedMeasurement,
+    recording: geometry.Recording,
     scheme: Scheme,
     *,
+    splines: FrameSmoother | None = None,
     spacings: Iterable[tuple[float, int]] = (),
     members: int = 0,
+    copies: int = _COPIES_OF_RECORDING,
     further: Iterable[geometry.Recording] = (),
 ) -> MemoryPrediction:
-    """What a run on a measurement will take at its peak.
+    """What a run on a recording will take at its peak.
 
     Args:
-        prepared: the measurement.
+        recording: the measurement, or what is forecast.
         scheme: of the simulators.
+        splines: its fits; None where none are made.
         spacings: particle spacing (m) and number of members of every simulation that lives beside others.
         members: of the ensemble; 0 without one.
+        copies: of all frames that are made on the way.
         further: more measurements of the beat.
     """
-    recording = prepared.recording
     dimension, field = recording.dimension, 4 * recording.dimension * recording.grid.size
     volume = float(recording.mask.reshape(recording.frames, -1).sum(1).max()) * float(np.prod(recording.grid.spacing))
     runs = list(spacings)
     particles = sum(int(count * volume / spacing**dimension) for spacing, count in runs) * _PER_PARTICLE[dimension]
     arrays = sum(value.nbytes for one in (recording, *further) for value in one.arrays().values())
     return MemoryPrediction(
-        splines=_splines(prepared),
+        splines=0 if splines is None else _splines(splines),
         particles=particles,
         tables=sum(_tables(recording, scheme, spacing) for spacing in dict(runs)),
         members=_COPIES_OF_MEMBERS * members * field,
-        recordings=arrays + _COPIES_OF_RECORDING * recording.frames * field,
+        recordings=arrays + copies * recording.frames * field,
     )
 
 
-def _splines(prepared: PreparedMeasurement) -> int:
+def _splines(splines: FrameSmoother) -> int:
     """Of the frame with the most nodes in its mask, by the knots and the band that its fit will have."""
-    recording, splines = prepared.recording, prepared.splines
+    recording = splines.recording
     frame = int(np.argmax(recording.mask.reshape(recording.frames, -1).sum(1)))
     inside = torch.from_numpy(np.array(recording.mask[frame], bool).reshape(-1))
     points = splines.nodes[inside].double()

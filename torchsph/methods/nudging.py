@@ -85,14 +85,16 @@ def _update(
 ) -> None:
     """Pull the particles towards the measurement of one frame; the first frame has no forecast to weigh against."""
     weight = node_weights(measured, frame)
+    used = weight > 0
+    if not used.any():  # a frame without data is forecast
+        return
     variance = error.variance(measured, frame).mean(0)
     observed = np.nan_to_num(measured.velocity[frame])
     gain = np.ones_like(weight)
     if background is not None:
-        used = weight > 0
         innovation = (observed - background.cpu().numpy())[:, used]
-        total = float(np.mean(innovation**2)) if used.any() else 0.0
-        own = max(total - float(variance[used].mean()) if used.any() else 0.0, _LEAST_FORECAST_SHARE * total)
+        total = float(np.mean(innovation**2))
+        own = max(total - float(variance[used].mean()), _LEAST_FORECAST_SHARE * total)
         gain = own / (own + variance) if total > 0 else np.zeros_like(weight)
     device, dtype = run.particles.position.device, run.particles.position.dtype
     fields = torch.from_numpy(np.concatenate([observed, gain[None]])).to(device, dtype)

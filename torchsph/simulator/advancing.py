@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
 
@@ -46,11 +48,14 @@ class AdvancingRun:
         parameters: the numbers of the scheme in use.
         record: accounts of the run.
         time: present time, s.
+        observers: each is called after every step with the present times of the members (members,), s, and the lengths
+            of their steps (members,), s, 0 where one waits or has failed; none: nobody looks on, which costs nothing.
     """
 
     def __init__(self, domain: Domain, backend: Backend, particles: Particles, time: float) -> None:
         self.domain, self.units, self.particles, self.time = domain, domain.units, particles, float(time)
         self.surroundings, self._backend = PresentSurroundings(domain), backend
+        self.observers: list[Callable[[Tensor, Tensor], None]] = []
         scene, scheme = domain.scene, domain.scheme
         self.record = Record(particles.members, len(scene.valves), particles.position.device)
         self.parameters = Parameters.of(scheme, scene.fluid.viscosity)
@@ -80,6 +85,20 @@ class AdvancingRun:
     def members(self) -> int:
         """Number of members, failed ones included."""
         return self.particles.members
+
+    @property
+    def backend(self) -> Backend:
+        """For sums over neighbours."""
+        return self._backend
+
+    @property
+    def period(self) -> Tensor | None:
+        """(D,), internal, of the periodic box, or None."""
+        return self.domain.period
+
+    def pressure(self) -> Tensor:
+        """(N,), Pa, of the particles: up to a constant where nothing prescribes one."""
+        return self._stepper.pressure(self.particles) * (self.domain.scene.fluid.density * self.units.speed**2)
 
     def advance(self, until: float) -> None:
         """Step every member that has not failed to time ``until`` (s), each with its own time step.
@@ -150,6 +169,10 @@ class AdvancingRun:
             self.surroundings.at(self.time + done * self.units.time)
             self._prepare_step(step > 0)
             done = self._take_step(step, done, earlier)
+            if self.observers:
+                length = torch.where(self.record.failed, torch.zeros_like(step), step) * self.units.time
+                for observer in self.observers:
+                    observer(self.time + done * self.units.time, length)
 
     def _ramp(self, done: Tensor) -> None:
         """Let gamma grow, where the scheme has it grow."""
@@ -168,7 +191,7 @@ class AdvancingRun:
 
         Particles that have crossed an open valve change sides in every step: the flow must not feel the search.
         """
-        particles, renumbered = self.surroundings.exchange(self.particles, self.record, self._stepper.pressure)
+        particles, renumbered = self.surroundings.exchange(self.particles, self.record, self._stepper.pressure, active)
         if self._population is not None:
             particles, changed = self._population.controlled_when_due(particles, active)
             renumbered |= changed
@@ -176,7 +199,7 @@ class AdvancingRun:
             self._acceleration = rows_carried(self.particles, particles, self._acceleration)
         self.particles = particles
         if self._pressures is not None:
-            self.particles = self._pressures.driven(self.particles, self.surroundings.clock, self._stepper)
+            self.particles = self._pressures.driven(self.particles, self.surroundings.clock, self._stepper, active)
         self.particles, self._acceleration = self._spatial.when_due(self.particles, self._acceleration)
 
     def _take_step(self, step: Tensor, done: Tensor, earlier: RollbackStates | None) -> Tensor:

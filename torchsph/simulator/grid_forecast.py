@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 import geometry
+from torchsph.pairs.moving_least_squares import Fetched
 
 from .simulator import Simulation, Simulator
 
@@ -46,6 +47,7 @@ class GridForecast:
         time: s.
         transfer: between grid and particles.
         seed: of the particles.
+        rates: keep what `rate` needs: one more fetch, of the start, where `transfer.fade` is None.
 
     Attributes:
         run: the simulation.
@@ -63,6 +65,7 @@ class GridForecast:
         transfer: Transfer,
         *,
         seed: int = 0,
+        rates: bool = False,
     ) -> None:
         batched = velocity if velocity.ndim == grid.dimension + 2 else velocity[None]
         self.grid, self.transfer, self.start_time = grid, transfer, time
@@ -72,8 +75,13 @@ class GridForecast:
         if transfer.projections and self.run.can_project:
             self.shock = self.run.project(transfer.projections).cpu()
         self._lost: Tensor | None = None
+        self._ends: list[tuple[float, Fetched]] | None = [] if rates else None  # the start and the last fetch
+        if transfer.fade is None and self._ends is None:
+            return
+        kept = self.run.fetch(grid, mask)
+        if self._ends is not None:
+            self._ends = [(time, Fetched(kept.value, mask & kept.covered))]
         if transfer.fade is not None:
-            kept = self.run.fetch(grid, mask)
             known = mask & kept.covered
             self._lost = torch.where(known[:, None], batched.to(kept.value) - kept.value, torch.zeros_like(kept.value))
 
@@ -84,7 +92,22 @@ class GridForecast:
         """
         self.run.advance(time)
         found = self.run.fetch(self.grid, mask)
+        if self._ends is not None:
+            self._ends = [self._ends[0], (time, Fetched(found.value, mask & found.covered))]
         if self._lost is None or self.transfer.fade is None:
             return found.value, found.covered
         fading = math.exp(-(time - self.start_time) / self.transfer.fade)
         return found.value + fading * self._lost * found.covered[:, None], found.covered
+
+    def rate(self) -> Tensor:
+        """Mean du/dt from the start to the last `at` (members, D, *shape), m/s^2; not a number where one is unknown.
+
+        Of the particles' own fields at both ends: what the transfer has lost of the start, and what the first
+        projection has taken, is in neither of them.
+        """
+        if self._ends is None or len(self._ends) < 2:
+            raise ValueError("GridForecast.rate needs rates=True and a field fetched after the start (`at`)")
+        (begin, first), (end, last) = self._ends
+        known = first.covered & last.covered
+        rate = (last.value - first.value) / (end - begin)
+        return torch.where(known[:, None], rate, torch.nan)

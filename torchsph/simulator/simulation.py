@@ -18,7 +18,7 @@ from .schemes.scheme import Scheme
 from .state.particles import Particles
 from .stepping.coefficients import Coefficients
 from .stepping.pressure import Neighbourhood, divergence_free
-from .transfer.checks import check_grid, check_mask, check_velocity, check_weight
+from .transfer.checks import check_grid, check_mask, check_some, check_velocity, check_weight
 from .transfer.fetching import fetch_on_grid
 from .transfer.imposing import pulled
 
@@ -92,7 +92,7 @@ class Simulation(AdvancingRun):
         Raises:
             TypeError: something else than tensors, or a mask that is not bool.
             ValueError: another dimension or shape than the run's and the grid's, no node in the mask, a velocity that
-                is not finite there, a confidence that is negative or not finite.
+                is not finite there, a confidence that is negative, not finite or 0 everywhere.
         """
         check_grid(grid, self.domain.scene.dimension)
         check_mask(mask, grid)
@@ -101,6 +101,7 @@ class Simulation(AdvancingRun):
             raise ValueError("mask holds no node: no velocity is known anywhere, so there is nothing to impose")
         if confidence is not None:
             check_weight("confidence", confidence, grid)
+            check_some("confidence", confidence, "give what is to be trusted more than 0, or None for all alike", mask)
         self._renumbered(self.surroundings.imposed(self.particles, grid, velocity, mask, self.time))
         carried = None
         if confidence is not None:
@@ -143,7 +144,8 @@ class Simulation(AdvancingRun):
             grid: the nodes, m.
             target: (D, *shape), m/s.
             gain: (*shape), in [0, 1].
-            weight: (*shape), not negative, confidence; 0 where nothing is known and the target may be anything.
+            weight: (*shape), not negative, confidence; 0 where nothing is known and the target may be anything, but not
+                everywhere.
 
         Raises:
             TypeError: something else than tensors of floating-point numbers.
@@ -151,6 +153,7 @@ class Simulation(AdvancingRun):
         """
         check_grid(grid, self.domain.scene.dimension)
         check_weight("weight", weight, grid)
+        check_some("weight", weight, "do not pull where there is no measurement")
         check_weight("gain", gain, grid, most=1.0)
         check_velocity("target", target, grid, weight > 0)
         p = self.particles
@@ -162,10 +165,17 @@ class Simulation(AdvancingRun):
     def fetch(self, grid: Grid, mask: Tensor) -> Fetched:
         """Velocities at the nodes where ``mask`` (*shape): value (members, D, *shape), covered (members, *shape).
 
+        A node a little beyond the walls has the velocity of the fluid before them.
+
         Raises:
             TypeError: a mask that is not bool.
             ValueError: another dimension or shape than the run's and the grid's.
         """
         check_grid(grid, self.domain.scene.dimension)
         check_mask(mask, grid)
-        return fetch_on_grid(self.particles, grid, mask, self.units, self._backend, self.domain.period)
+        nearest = None
+        if self.domain.walls is not None:
+            if not self.surroundings.entered:
+                self.surroundings.enter(self.time, self.time)
+            nearest = self.surroundings.nearest_fluid
+        return fetch_on_grid(self.particles, grid, mask, self.units, self._backend, self.domain.period, nearest)

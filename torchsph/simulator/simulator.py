@@ -39,6 +39,8 @@ class Simulator:
     backend: str = "auto"
     seeding: Seeding | None = None
     _domain: Domain = field(init=False, repr=False, compare=False)
+    # the last seeding: batches of an ensemble start from the same one, and making it takes as long as some steps
+    _seeded: dict[tuple[float, int], Particles] = field(init=False, repr=False, compare=False, default_factory=dict)
 
     def __post_init__(self) -> None:
         scheme = preset("weakly_compressible") if self.scheme is None else self.scheme
@@ -65,10 +67,14 @@ class Simulator:
         time = check_time(time, "time")
         if int(members) != members or members < 1:
             raise ValueError(f"a simulation needs at least one member, a whole number of them, got {members}")
-        generator = torch.Generator(device=self.device).manual_seed(check_seed(seed))
-        backend = choose_backend(self.backend, self.device)
-        single = seed_particles(self.domain, backend, time, generator, self.seeding)
-        return self.resume(single.repeated(members), time)
+        label = (time, check_seed(seed))
+        if label not in self._seeded:
+            generator = torch.Generator(device=self.device).manual_seed(label[1])
+            backend = choose_backend(self.backend, self.device)
+            single = seed_particles(self.domain, backend, time, generator, self.seeding)
+            self._seeded.clear()
+            self._seeded[label] = single
+        return self.resume(self._seeded[label].repeated(members), time)
 
     def resume(self, particles: Particles, time: float) -> Simulation:
         """Run on with particles in internal units that were made elsewhere.

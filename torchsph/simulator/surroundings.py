@@ -16,6 +16,7 @@ from .state.particles import Particles
 from .state.record import Record
 from .transfer.imposing import fill_beyond
 from .walls.compiled import near_wall
+from .walls.fields import STRAY
 from .walls.interface import WallSample
 from .walls.look_up import LookUp
 
@@ -40,6 +41,11 @@ class PresentSurroundings:
         self._bracket: tuple[float, float] = (0.0, 1.0)
         self._keys: tuple[Tensor, Tensor] | None = None
         self._fields: LookUp | None = None
+
+    @property
+    def entered(self) -> bool:
+        """Whether there are walls to look up: an interval was entered, and the scene has some."""
+        return self._fields is not None
 
     def enter(self, start: float, stop: float, *, shut: bool = False, valve_strength: float | Tensor = 1.0) -> None:
         """Choose key frames and open valves for an interval (s) without breaks inside.
@@ -80,15 +86,25 @@ class PresentSurroundings:
         return self._look_up(particles.position, fraction)
 
     def sample_at(self, position: Tensor) -> WallSample:
-        """Walls at points (n, D), internal, at the present time (one for all members).
+        """Walls at points (n, D), internal, in the middle of the interval, an instant that all members have in common.
 
         Raises:
             ValueError: the scene has no walls.
         """
         early, late = self._bracket
-        passed = float((self.clock.times.max() - early) / (late - early)) if late > early else 0.0
+        passed = (self.clock.middle - early) / (late - early) if late > early else 0.0
         fraction = torch.full((), min(max(passed, 0.0), 1.0), dtype=self.domain.dtype, device=self.domain.device)
         return self._look_up(position, fraction)
+
+    def nearest_fluid(self, position: Tensor) -> Tensor:
+        """Points (n, D), internal, with those beyond the walls moved onto them, at the present time.
+
+        Only as far out as distances are exact: farther away nothing is known of the fluid anyway.
+        """
+        wall = self.sample_at(position)
+        out = (-wall.distance).clamp_min(0.0)
+        out = torch.where(out <= STRAY, out, torch.zeros_like(out))
+        return position + out[:, None] * wall.normal
 
     def _look_up(self, position: Tensor, fraction: Tensor) -> WallSample:
         """Walls at points (n, D), ``fraction`` () or (n,) of the way from the earlier fields to the later ones."""
@@ -121,13 +137,17 @@ class PresentSurroundings:
         return self.domain.valves.finished(particles, self.clock, time, record, pressure)
 
     def exchange(
-        self, particles: Particles, record: Record, pressure: Callable[[Particles], Tensor]
+        self, particles: Particles, record: Record, pressure: Callable[[Particles], Tensor], stepping: Tensor
     ) -> tuple[Particles, bool]:
         """Pass particles between fluid and buffers; True where the particles were renumbered.
 
-        ``pressure`` gives p / rho0 of particles, for the account of the energy that passes.
+        Args:
+            particles: of all members.
+            record: where they are noted.
+            pressure: gives p / rho0 of particles, for the account of the energy that passes.
+            stepping: (members,) bool, whose particles are passed.
         """
-        return self.domain.valves.exchange(particles, self.clock, record, pressure)
+        return self.domain.valves.exchange(particles, self.clock, record, pressure, stepping)
 
     def constrain(
         self, before: Particles, after: Particles, wall: WallSample | None, step: Tensor, record: Record
@@ -173,7 +193,7 @@ class PresentSurroundings:
         return particles.position.index_add(0, row, distance[:, None] * wall.normal)
 
     def beyond_valves(self, position: Tensor) -> Tensor:
-        """(n,) bool: points (n, D), internal, at an open valve or behind it, where the walls' distance knows no end."""
+        """(n,) bool: points (n, D), internal, at an open valve or behind it, in the middle of the interval."""
         return self.domain.valves.beyond(position, self.clock)
 
     def account(self, particles: Particles, record: Record, time: float, since: float) -> None:

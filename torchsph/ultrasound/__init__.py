@@ -1,10 +1,14 @@
 """Ultrasound: from flow to echoes and back to velocities, and a noise model of the whole for sweeps.
 
-The simulated scanner (`scanner`) and the estimators (`estimation`) meet in the IQ packets of `acquisition` alone:
-neither imports the other. `measurements` joins the two on a recording.
+The simulated scanner (`scanner`), the beamformer of channel data (`beamforming`) and the estimators (`estimation`)
+meet in the IQ packets of `acquisition` alone: none imports another. `measurements` joins the first and the last on a
+recording.
 """
 
-from .acquisition import Acquisition, Beams, Packet
+from .acquisition import Acquisition, Beams, IQPhase, Packet
+from .beamforming.channel_data import ChannelData, read_channel_data
+from .beamforming.delay_and_sum import DelayAndSum, delay_and_sum
+from .beamforming.demodulation import demodulated
 from .estimation.clutter import ClutterFilter, FIRFilter, PolynomialFilter, SVDFilter
 from .estimation.doppler import ColourDoppler, DopplerEstimates, colour_doppler, vector_doppler
 from .estimation.estimates import Estimates, Flag
@@ -14,7 +18,9 @@ from .measurements.calibration import Calibration, fit_calibration
 from .measurements.doppler import DopplerOptions, measure_doppler
 from .measurements.noise import NoiseModel, measure_noise
 from .measurements.speckle import SpeckleOptions, measure_speckle
+from .measurements.tracked import TrackingPlan, read_uff_recording, track_recording
 from .measurements.training import SwirlFlow, TrainingPlan, calibrate, random_scene, random_swirl
+from .phase import PhaseSlope, baseband, phase_slope
 from .scanner.echoes import EchoModel, simulate_packet
 from .scanner.flow import Flow, LinearFlow, RecordingFlow
 from .scanner.pointspread import GaussianPointSpread, PointSpread, SampledPointSpread, SectorPointSpread
@@ -24,8 +30,10 @@ __all__ = [
     "Acquisition",
     "Beams",
     "Calibration",
+    "ChannelData",
     "ClutterFilter",
     "ColourDoppler",
+    "DelayAndSum",
     "DopplerEstimates",
     "DopplerOptions",
     "EchoModel",
@@ -34,10 +42,12 @@ __all__ = [
     "Flag",
     "Flow",
     "GaussianPointSpread",
+    "IQPhase",
     "LibraryTracker",
     "LinearFlow",
     "NoiseModel",
     "Packet",
+    "PhaseSlope",
     "PointSpread",
     "PolynomialFilter",
     "RecordingFlow",
@@ -48,19 +58,27 @@ __all__ = [
     "SpeckleTracker",
     "SwirlFlow",
     "Tracker",
+    "TrackingPlan",
     "TrainingPlan",
     "UffVolumes",
+    "baseband",
     "calibrate",
     "colour_doppler",
+    "delay_and_sum",
+    "demodulated",
     "fit_calibration",
     "measure_doppler",
     "measure_noise",
     "measure_speckle",
+    "phase_slope",
     "random_scene",
     "random_swirl",
+    "read_channel_data",
     "read_uff",
+    "read_uff_recording",
     "simulate_packet",
     "track",
+    "track_recording",
     "vector_doppler",
     "write_uff",
 ]

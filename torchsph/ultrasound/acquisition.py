@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from enum import Enum
 
 import torch
 from torch import Tensor
@@ -98,12 +99,22 @@ class Beams:
         return away / away.norm(dim=-1, keepdim=True)
 
 
+class IQPhase(Enum):
+    """What the phase of IQ samples does along depth z, for echoes of a carrier f.
+
+    In both, motion away from the probe turns the phase of a sample backwards, so that Doppler sees no difference;
+    what compares samples at different depths, as speckle tracking does, must know which one it has.
+    """
+
+    BASEBAND = "baseband"
+    """Demodulated at the depth of the sample: an echo from z carries exp(-i 4 pi f z / c) wherever it is sampled."""
+    CARRIER = "carrier"
+    """As delay-and-sum leaves it: the carrier exp(+i 4 pi f z / c) of the sample's own depth is still in."""
+
+
 @dataclass(frozen=True, eq=False)
 class Packet:
     """IQ samples of T images on a grid.
-
-    The baseband convention is that of demodulation at the depth of the sample: an echo from depth z
-    carries the phase exp(-i 4 pi f z / c), so motion away from the probe turns the phase backwards.
 
     Args:
         iq: (T, *shape), complex64 or complex128, the samples.
@@ -112,6 +123,8 @@ class Packet:
         beams: along which beams.
         noise: power of the thermal noise per sample where it is known (scanners measure it with the
             transmitter off).
+        phase: what the samples' phase does along depth; ``None`` = what the samples themselves say when they are
+            first used, see :func:`baseband`.
     """
 
     iq: Tensor
@@ -119,6 +132,7 @@ class Packet:
     acquisition: Acquisition
     beams: Beams
     noise: float | None = None
+    phase: IQPhase | None = None
 
     def __post_init__(self) -> None:
         if not self.iq.is_complex():
@@ -128,9 +142,9 @@ class Packet:
         if self.beams.dimension != self.grid.dimension:
             raise ValueError(f"beams are {self.beams.dimension}-D, the grid {self.grid.dimension}-D")
 
-    def with_iq(self, iq: Tensor, *, noise: float | None = None) -> Packet:
-        """The same packet with other samples (filtered ones, say)."""
-        return replace(self, iq=iq, noise=noise)
+    def with_iq(self, iq: Tensor, *, noise: float | None = None, phase: IQPhase | None = None) -> Packet:
+        """The same packet with other samples (filtered ones, say), of which noise and phase are stated anew."""
+        return replace(self, iq=iq, noise=noise, phase=phase)
 
 
 def decibel(ratio: Tensor) -> Tensor:

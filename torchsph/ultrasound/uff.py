@@ -17,6 +17,7 @@ import torch
 from geometry import Grid
 
 from .acquisition import Acquisition, Beams, Packet
+from .phase import baseband
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +37,7 @@ class UffVolumes:
     modulation_frequency: float | None = None
 
     def packet(self, beams: Beams, *, sound_speed: float = 1540.0, noise: float | None = None) -> Packet:
-        """The volumes as a packet to track.
+        """The volumes as a packet to track, in baseband whichever convention the file's IQ has.
 
         Args:
             beams: along which the samples were taken; UFF's beamformed data do not say.
@@ -44,14 +45,15 @@ class UffVolumes:
             noise: power of the thermal noise per sample, if known.
 
         Raises:
-            ValueError: where they are no IQ or lack their rates.
+            ValueError: where they are no IQ, lack their rates, or their phase fits no convention.
         """
         if not np.iscomplexobj(self.values) or self.values.shape[1] != 1:
             raise ValueError("these UFF volumes are no IQ: they must be complex with one channel")
         if self.frame_rate is None or self.modulation_frequency is None:
             raise ValueError("the UFF file states no frame_rate or no modulation_frequency; set them in UffVolumes")
         acquisition = Acquisition(self.modulation_frequency, sound_speed, self.frame_rate, len(self.values))
-        return Packet(torch.from_numpy(np.ascontiguousarray(self.values[:, 0])), self.grid, acquisition, beams, noise)
+        iq = torch.from_numpy(np.ascontiguousarray(self.values[:, 0]))
+        return baseband(Packet(iq, self.grid, acquisition, beams, noise))
 
 
 def read_uff(path: str | Path, name: str = "beamformed_data") -> UffVolumes:

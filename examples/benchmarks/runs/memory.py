@@ -1,6 +1,6 @@
-"""Predicted against measured memory of whole ensemble runs, each in a process of its own.
+"""Predicted against measured memory of whole runs, each in a process of its own.
 
-    python examples/benchmarks/runs/memory.py [--quick]
+    python examples/benchmarks/runs/memory.py [--quick] [N ...]
 
 Prints, for each scene, what `torchsph.methods.memory` predicts beyond the process at its start, the peak of resident
 memory that the run then added to it (getrusage), their ratio, and the ratio of the whole processes' peaks.
@@ -8,6 +8,7 @@ memory that the run then added to it (getrusage), their ratio, and the ratio of 
 
 from __future__ import annotations
 
+import argparse
 import json
 import resource
 import subprocess
@@ -19,15 +20,22 @@ import numpy as np
 ROOT = Path(__file__).resolve().parents[3]
 sys.path.insert(0, str(ROOT))
 
-# recording, frames, particle spacing (m; None: the default), members
+# what is run, recording, frames, particle spacing (m; None: the default), members
 SCENES = (
-    ("sample", 2, None, 3),
-    ("sample", 8, None, 16),
-    ("sample", 2, 1.5e-3, 16),
-    ("sample", 2, 1e-3, 16),
-    ("phantom", 3, None, 16),
-    ("plane", 2, None, 8),
-    ("box", 2, None, 4),
+    ("ensemble", "sample", 2, None, 3),
+    ("spline", "sample", 3, None, 0),
+    ("free", "sample", 3, None, 0),
+    ("forecast", "sample", 3, None, 0),
+    ("ensemble", "sample", 8, None, 16),
+    ("ensemble", "sample", 2, 1.5e-3, 16),
+    ("ensemble", "sample", 2, 1e-3, 16),
+    ("ensemble", "phantom", 3, None, 16),
+    ("ensemble", "plane", 2, None, 8),
+    ("ensemble", "box", 2, None, 4),
+    ("spline", "phantom", 3, None, 0),
+    ("free", "phantom", 3, None, 0),
+    ("forecast", "phantom", 3, None, 0),
+    ("forecast", "sample", 3, 1e-3, 0),
 )
 
 
@@ -57,34 +65,43 @@ def peak() -> int:
     return 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 
 
-def run(name: str, frames: int, spacing: float | None, members: int) -> dict[str, float]:
+def run(method: str, name: str, frames: int, spacing: float | None, members: int) -> dict[str, float]:
     """One scene in this process."""
     from torchsph.methods import by_name
     from torchsph.methods.measurement.prepared import PreparedMeasurement
 
     measured = scene(name, frames)
     start = peak()
-    prepared = PreparedMeasurement(measured)
-    foretold = by_name.predicted_memory(prepared, ("ensemble",), spacing=spacing, members=members).total
-    by_name.run_methods(measured, ("ensemble",), spacing=spacing, members=members)
+    if method == "forecast":
+        leads = np.diff(measured.time)[:1].tolist()
+        foretold = by_name.predicted_forecast_memory(measured, spacing=spacing).total
+        by_name.forecast_skill(measured, leads, spacing=spacing)
+    else:
+        options = {"spacing": spacing} | ({"members": members} if members else {})
+        foretold = by_name.predicted_memory(PreparedMeasurement(measured), (method,), **options).total
+        by_name.run_methods(measured, (method,), **options)
     return {"start": start, "predicted": foretold, "measured": peak() - start}
 
 
 def main() -> None:
-    """Run the scenes one after another and print the table."""
-    if len(sys.argv) > 1 and sys.argv[1] == "--scene":
-        print(json.dumps(run(*SCENES[int(sys.argv[2])])))
+    """Run the scenes, or those of the numbers given, one after another and print the table."""
+    parser = argparse.ArgumentParser(description=str(__doc__).splitlines()[0])
+    parser.add_argument("scenes", nargs="*", type=int, metavar="N", help="numbers of scenes, from 0 (all)")
+    parser.add_argument("--quick", action="store_true", help="the first four, on the sample")
+    parser.add_argument("--scene", type=int, help=argparse.SUPPRESS)
+    args = parser.parse_args()
+    if args.scene is not None:
+        print(json.dumps(run(*SCENES[args.scene])))
         return
-    print(
-        f"{'scene':8} {'frames':>6} {'spacing':>8} {'members':>7} {'predicted MB':>12} {'measured MB':>11} ratio  whole"
-    )
-    for number in range(2 if "--quick" in sys.argv else len(SCENES)):
+    sizes = f"{'predicted MB':>12} {'measured MB':>11} ratio  whole"
+    print(f"{'run':8} {'scene':8} {'frames':>6} {'spacing':>8} {'members':>7} {sizes}")
+    for number in args.scenes or range(4 if args.quick else len(SCENES)):
         call = [sys.executable, "-W", "ignore", __file__, "--scene", str(number)]
         found = json.loads(subprocess.run(call, check=True, capture_output=True, text=True).stdout.splitlines()[-1])
-        name, frames, spacing, members = SCENES[number]
+        method, name, frames, spacing, members = SCENES[number]
         ratio = found["predicted"] / found["measured"]
         whole = (found["start"] + found["predicted"]) / (found["start"] + found["measured"])
-        told = f"{name:8} {frames:6} {spacing or '-':>8} {members:7} {found['predicted'] / 1e6:12.0f}"
+        told = f"{method:8} {name:8} {frames:6} {spacing or '-':>8} {members:7} {found['predicted'] / 1e6:12.0f}"
         print(f"{told} {found['measured'] / 1e6:11.0f} {ratio:5.2f}  {whole:5.2f}", flush=True)
 
 

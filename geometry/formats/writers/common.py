@@ -9,8 +9,9 @@ import numpy as np
 from geometry.formats.source import FormatError
 from geometry.recordings.recording import Recording, Wall
 
-UNITS = {"velocity": "m s-1", "sigma": "m s-1", "pressure": "Pa", "mask": "1", "weight": "1", "beam": "1"}
-SCALARS = ("mask", "weight", "pressure")
+UNITS = {"velocity": "m s-1", "sigma": "m s-1", "pressure": "Pa", "pressure_sigma": "Pa"}
+UNITS |= {"mask": "1", "weight": "1", "beam": "1"}
+SCALARS = ("mask", "weight", "pressure", "pressure_sigma")
 VECTORS = ("velocity", "sigma", "beam")
 
 

@@ -24,8 +24,8 @@ TOPOLOGIES = ("Vertices", "Lines", "Polygons", "Strips")
 
 def write_vtkhdf(path: Path, recording: Recording) -> list[Path]:
     """The fields of the grid to `path`, the wall beside it as `NAME_wall.vtkhdf`."""
-    with _in_memory(path) as file:
-        points = _image(file, recording)
+    with in_memory(path) as file:
+        points = image_data(file, recording)
         for name in VECTORS:
             field = vector(recording, name)
             if field is not None:
@@ -34,36 +34,12 @@ def write_vtkhdf(path: Path, recording: Recording) -> list[Path]:
             values = scalar(recording, name)
             if values is not None:
                 _store(points, name, values, recording.dimension)
-        _steps(file["VTKHDF"], recording.time, list(points))
-    return [path, *_wall(path, recording)]
-
-
-def write_sidecar(recording_file: str | Path) -> list[Path]:
-    """VTKHDF files beside a recording's file that show its data without a copy, by virtual datasets.
-
-    Args:
-        recording_file: a file that `write_recording` wrote; the sidecar must stay beside it.
-
-    Returns:
-        The files written: `NAME.vtkhdf` for the fields, `NAME_wall.vtkhdf` for the wall.
-    """
-    from geometry.recordings.read import read_recording
-
-    source = Path(recording_file)
-    recording = read_recording(source)
-    path = source.with_suffix(".vtkhdf")
-    with _in_memory(path) as file, h5py.File(source, "r") as original:
-        points = _image(file, recording)
-        for name in (*VECTORS, *SCALARS):
-            node = original.get(f"/{name}")
-            if node is not None:
-                _virtual(points, name, node, recording, source.name)
-        _steps(file["VTKHDF"], recording.time, list(points))
+        time_steps(file["VTKHDF"], recording.time, list(points))
     return [path, *_wall(path, recording)]
 
 
 @contextmanager
-def _in_memory(path: Path) -> Iterator[h5py.File]:
+def in_memory(path: Path) -> Iterator[h5py.File]:
     """A file that is made in memory and written whole: HDF5 does not survive a disk that is full."""
     with h5py.File(f"{path} in memory", "w", driver="core", backing_store=False) as file:
         yield file
@@ -181,7 +157,8 @@ def _grow(group: h5py.Group, name: str, values: np.ndarray) -> None:
         node[-len(values) :] = values
 
 
-def _image(file: h5py.File, recording: Recording) -> h5py.Group:
+def image_data(file: h5py.File, recording: Recording) -> h5py.Group:
+    """The head of an image file: its lattice; what is returned holds the fields."""
     origin, spacing, counts = lattice(recording)
     root = file.create_group("VTKHDF")
     root.attrs["Version"] = np.array([2, 0], np.int64)
@@ -192,7 +169,8 @@ def _image(file: h5py.File, recording: Recording) -> h5py.Group:
     return root.create_group("PointData")
 
 
-def _steps(root: h5py.Group, time: np.ndarray, names: list[str]) -> None:
+def time_steps(root: h5py.Group, time: np.ndarray, names: list[str]) -> None:
+    """The times of an image file whose fields of those names have one entry for each."""
     if len(time) == 1:
         root.create_group("FieldData")["TimeValue"] = np.asarray(time, np.float64)
         return
@@ -211,30 +189,6 @@ def _store(points: h5py.Group, name: str, values: np.ndarray, dimension: int) ->
     if len(values) == 1:  # a single time has no axis of times in VTK's eyes
         values, chunk = values[0], values.shape[1:]
     points.create_dataset(name, data=values, chunks=chunk, compression="gzip", shuffle=True)
-
-
-def _virtual(points: h5py.Group, name: str, node: h5py.Dataset, recording: Recording, file: str) -> None:
-    """A view of a dataset of the recording in the order that VTK wants: components last."""
-    shape, is_vector = (recording.frames, *recording.grid.shape), name in VECTORS
-    source = h5py.VirtualSource(file, f"/{name}", shape=node.shape, dtype=node.dtype)
-    still = node.ndim == recording.dimension + is_vector
-    layout = h5py.VirtualLayout((*shape, 3) if is_vector else shape, node.dtype)
-    if recording.frames == 1:  # a single time has no axis of times in VTK's eyes
-        layout = h5py.VirtualLayout(layout.shape[1:], node.dtype)
-        whole = () if still else (0,)
-        if not is_vector:
-            layout[...] = source[(*whole, ...)]
-        for component in range(recording.dimension if is_vector else 0):
-            layout[..., component] = source[(*whole, component)]
-        points.create_virtual_dataset(name, layout, fillvalue=0)
-        return
-    for frame in range(recording.frames) if still else [slice(None)]:
-        if not is_vector:
-            layout[frame] = source if still else source[...]
-            continue
-        for component in range(recording.dimension):
-            layout[(frame, ..., component)] = source[component] if still else source[:, component]
-    points.create_virtual_dataset(name, layout, fillvalue=0)
 
 
 def _wall(path: Path, recording: Recording) -> list[Path]:

@@ -10,7 +10,7 @@ import h5py
 import numpy as np
 import pytest
 
-from geometry import Grid, Recording, read_recording, write_recording
+from geometry import Grid, Recording, Wall, read_recording, write_recording
 from geometry.formats import FieldMap, FormatError, PolySeries, WallOptions, convert, export, write_sidecar
 
 EXTRA = "the extra `formats` is not installed"
@@ -84,16 +84,37 @@ def test_vtkhdf_opens_in_vtk_at_every_time(recording: Recording, tmp_path: Path,
 
 def test_a_sidecar_holds_no_copy_of_the_fields(recording: Recording, tmp_path: Path) -> None:
     write_recording(tmp_path / "a.h5", recording)
-    sidecar, _ = write_sidecar(tmp_path / "a.h5")
+    sidecar, wall = write_sidecar(tmp_path / "a.h5")
+    with h5py.File(wall) as file:
+        assert file["VTKHDF/Points"].is_virtual and file["VTKHDF/PointData/velocity"].is_virtual
     with h5py.File(sidecar) as file:
         points = file["VTKHDF/PointData"]
         assert {"velocity", "mask", "weight"} == set(points) and all(node.is_virtual for node in points.values())
         np.testing.assert_array_equal(points["weight"][()], recording.weight)
     (tmp_path / "elsewhere").mkdir()
-    for name in ("a.h5", "a.vtkhdf"):
+    for name in ("a.h5", "a.vtkhdf", "a_wall.vtkhdf"):
         (tmp_path / name).rename(tmp_path / "elsewhere" / name)
-    with h5py.File(tmp_path / "elsewhere" / "a.vtkhdf") as file:  # both moved: the link is relative
+    with h5py.File(tmp_path / "elsewhere" / "a.vtkhdf") as file:  # all moved: the links are relative
         assert file["VTKHDF/PointData/velocity"][()].any()
+    with h5py.File(tmp_path / "elsewhere" / "a_wall.vtkhdf") as file:
+        np.testing.assert_array_equal(file["VTKHDF/Points"][()], recording.wall.vertices.reshape(-1, 3))
+
+
+def test_a_sidecar_shows_a_wall_at_rest_and_a_wall_without_velocities(recording: Recording, tmp_path: Path) -> None:
+    pytest.importorskip("vtk", reason=EXTRA)
+    from vtkmodules.vtkIOHDF import vtkHDFReader
+
+    moving = Wall(recording.wall.vertices, recording.wall.faces, recording.wall.region)
+    still = Wall(recording.wall.vertices[0], recording.wall.faces, recording.wall.region)
+    rate = np.gradient(moving.vertices, recording.time, axis=0)
+    for name, wall, speed in (("moving", moving, rate), ("still", still, np.zeros_like(rate))):
+        write_recording(tmp_path / f"{name}.h5", replace(recording, wall=wall))
+        reader = vtkHDFReader()
+        reader.SetFileName(str(write_sidecar(tmp_path / f"{name}.h5")[1]))
+        for frame in (2, 0, 1):
+            points, velocity = image_at(reader, recording.time[frame])
+            np.testing.assert_allclose(points, wall.at(frame).vertices, atol=1e-12)
+            np.testing.assert_allclose(velocity, speed[frame], atol=1e-7)
 
 
 def test_vtkhdf_is_converted_back(recording: Recording, tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ import csv
 import json
 import os
 import signal
+import subprocess
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -139,6 +140,22 @@ def written(path: Path, program: str) -> str:
     path.write_text(f"#!/usr/bin/env -S {os.path.realpath('/proc/self/exe')} -S -E\n{program}\n")
     path.chmod(0o755)
     return str(path)
+
+
+def test_a_request_to_stop_amid_the_start_of_a_child_does_not_leave_it_behind(tmp_path, monkeypatch):
+    started = []
+
+    def popen(*arguments, **options):
+        started.append(real(*arguments, **options))
+        os.kill(os.getpid(), signal.SIGTERM)
+        return started[0]
+
+    real = subprocess.Popen
+    monkeypatch.setattr(child.sys, "executable", written(tmp_path / "python", "import time; time.sleep(60)"))
+    monkeypatch.setattr(child.subprocess, "Popen", popen)
+    with pytest.raises(Stopped), StopSignals():
+        run_child([], tmp_path / "log.txt")
+    assert started[0].poll() == -signal.SIGTERM
 
 
 def test_a_request_to_stop_is_handed_on_to_the_child(tmp_path, monkeypatch):

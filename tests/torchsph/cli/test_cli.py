@@ -104,7 +104,9 @@ def assimilated(files, tmp_path_factory) -> tuple[Path, subprocess.CompletedProc
 def test_assimilate_writes_what_it_promises(assimilated, files):
     folder, done = assimilated
     analyses = {f"{name}.h5" for name in pipeline.METHODS}
-    assert {path.name for path in folder.iterdir()} == analyses | {
+    views = {f"{name}{end}.vtkhdf" for name in (*pipeline.METHODS, "analysis") for end in ("", "_wall")}
+    assert max((folder / name).stat().st_size for name in views) < 100_000  # they hold no copy
+    assert {path.name for path in folder.iterdir()} == analyses | views | {
         "analysis.h5",
         "report.png",
         "report.html",
@@ -219,7 +221,7 @@ def test_measure_then_smooth_then_info(files, tmp_path):
     assert measured.returncode == 0, measured.stderr
     recording = geometry.read_recording(tmp_path / "m.h5")
     assert recording.frames == 3 and recording.weight is not None
-    smoothed = torchsph("smooth", "m.h5", "--out", "s.h5", cwd=tmp_path)
+    smoothed = torchsph("smooth", "m.h5", "--out", "s.h5", "--no-sidecar", cwd=tmp_path)
     assert smoothed.returncode == 0, smoothed.stderr
     assert list(rows(smoothed.stdout)) == ["method", "raw", "spline"]
     told = torchsph("info", "s.h5", cwd=tmp_path)

@@ -11,6 +11,7 @@ from torchsph.cli.command import Command
 from torchsph.cli.cures import late_fault
 from torchsph.cli.exit_codes import ExitCode, exit_code
 from torchsph.cli.main import main
+from torchsph.methods.memory import NotEnoughMemory
 from torchsph.simulator.failures import NumericalFailure
 
 FULL = argparse.Namespace(measurement="m.h5", members=None, spacing=None, preset="default")
@@ -32,6 +33,8 @@ def test_memory_and_numbers() -> None:
     assert late_fault(MemoryError(), ExitCode.MEMORY, alone) == (
         "a.h5: out of memory; close other programs, or use a larger machine"
     )
+    foretold = NotEnoughMemory("needs about 34 GB of memory (tables 30 GB); try a larger --spacing")
+    assert late_fault(foretold, exit_code(foretold), FULL) == f"m.h5: {foretold}"
     failed = NumericalFailure("all 3 members have failed at about 0.3 s")
     assert late_fault(failed, exit_code(failed), FULL) == (
         "m.h5: all 3 members have failed at about 0.3 s; try another --spacing or another --preset"

@@ -36,7 +36,47 @@ def test_flow_through_an_opening_converges(box_recording):
         flow = OpeningFlow(recording.grid, recording.mask[0], wall, 1).rate(recording.velocity[0])
         exact = -(0.01**2 + 0.01 * (1 - np.cos(2)) / 200 * np.sin(2.5))
         errors.append(abs(flow / exact - 1))
-    assert order([1 / n for n in nodes], errors) > 1.8 and errors[-1] < 2e-3
+    assert order([1 / n for n in nodes], errors) > 1.7 and max(errors) < 3e-3 and errors[-1] < 3e-4
+
+
+def test_two_openings_share_what_the_walls_sweep():
+    """A box whose lower side rises: what leaves through the halves of its lid, by the velocities of both."""
+    step, size, rise = 5e-4, 0.01, 0.2
+    grid = geometry.Grid.covering((0.0,) * 3, (size,) * 3, step)
+    grid = geometry.Grid(tuple(o + 0.5 * step for o in grid.origin), grid.spacing, grid.shape)
+    points = grid.nodes().numpy()
+    mask = ((points > 0) & (points < size)).all(1).reshape(grid.shape)
+    # u_z = rise at the bottom, and at the lid rise (1 + tilt) over one half of x, rise (1 - tilt) over the other
+    tilt, z = 0.5, points[:, 2] / size
+    profile = np.cos(np.pi * points[:, 0] / size)
+    up = rise * (1 + tilt * z * profile)
+    across = -rise * tilt * np.sin(np.pi * points[:, 0] / size) / np.pi
+    velocity = on_grid(grid, np.stack([across, 0 * up, up], 1), mask)
+    wall = walls_of_box(size, 0.5 * step, rise)
+    flows = [float(OpeningFlow(grid, mask, wall, region, [3 - region]).rate(velocity)) for region in (1, 2)]
+    whole = rise * size**2
+    exact = [-whole * (0.5 + tilt / np.pi), -whole * (0.5 - tilt / np.pi)]
+    assert sum(flows) == pytest.approx(-whole, rel=0.01)
+    assert flows == pytest.approx(exact, rel=0.03)
+
+
+def walls_of_box(size, step, rise):
+    """Points of a box: the lid is region 1 where x < size / 2 and region 2 beyond; the bottom rises."""
+    line = step * (np.arange(round(size / step)) + 0.5)
+    one, other = (part.ravel() for part in np.meshgrid(line, line))
+    points, normals, velocities, region = [], [], [], []
+    for axis in range(3):
+        for end in (0.0, size):
+            side = np.insert(np.stack([one, other], 1), axis, end, axis=1)
+            points.append(side)
+            normals.append(np.tile((1.0 if end else -1.0) * np.eye(3)[axis], (len(side), 1)))
+            bottom = axis == 2 and not end
+            velocities.append(np.tile([0.0, 0.0, rise * bottom], (len(side), 1)))
+            lid = np.where(side[:, 0] < size / 2, 1, 2) if axis == 2 and end else np.zeros(len(side), int)
+            region.append(lid)
+    areas = np.full(6 * len(one), step**2)
+    parts = (np.concatenate(each) for each in (points, normals, velocities))
+    return geometry.WallPoints(*parts, areas, np.concatenate(region))
 
 
 def test_an_opening_that_moves_with_the_blood_lets_nothing_through(box_recording):

@@ -6,19 +6,27 @@ import os
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
 import torchsph
-from geometry import Grid, Recording
+from geometry import Grid, Recording, write_recording
 from torchsph import EnsembleOptions
+from torchsph.cli import main
 from torchsph.methods.ensemble.identity import ensemble_key
 from torchsph.methods.measurement.prepared import PreparedMeasurement
 from torchsph.methods.runtime import checkpoint
+from torchsph.methods.runtime.watching import Stopped
 
 STATE = {"x": torch.arange(500.0), "list": [1, 2.5, None, "text"]}
+
+
+def load(path: Path, key: str) -> dict[str, Any] | None:
+    """The state of a checkpoint as a run of that key gets it."""
+    return checkpoint.shared_state(checkpoint.Saved.read(path), key)
 
 
 @pytest.fixture(name="path")
@@ -29,9 +37,9 @@ def _path(tmp_path: Path) -> Path:
 
 
 def test_it_comes_back(path: Path) -> None:
-    back = checkpoint.load(path, "key")
+    back = load(path, "key")
     assert torch.equal(back["x"], STATE["x"]) and back["list"] == STATE["list"]
-    assert checkpoint.load(path.with_name("none.pt"), "key") is None
+    assert load(path.with_name("none.pt"), "key") is None
     assert os.listdir(path.parent) == ["checkpoint.pt"]
 
 
@@ -42,7 +50,7 @@ def test_no_flipped_bit_passes(path: Path) -> None:
         bad = bytearray(good)
         bad[place] ^= 1 << int(draw.integers(8))
         path.write_bytes(bad)
-        for look in (lambda: checkpoint.refuse_damaged(path), lambda: checkpoint.load(path, "key")):
+        for look in (lambda: checkpoint.Saved.read(path), lambda: load(path, "key")):
             with pytest.raises(ValueError, match=r"checkpoint.pt: .*remove it and start anew"):
                 look()
 
@@ -54,16 +62,16 @@ def test_what_is_cut_or_none_is_refused(path: Path) -> None:
     for content in (*others, *(good[:length] for length in range(0, len(good), 61))):
         path.write_bytes(content)
         with pytest.raises(ValueError, match=r"checkpoint.pt: .*remove it and start anew"):
-            checkpoint.load(path, "key")
+            load(path, "key")
     path.unlink()
     path.mkdir()
     with pytest.raises(FileExistsError, match=r"checkpoint.pt: is a folder"):
-        checkpoint.refuse_damaged(path)
+        checkpoint.Saved.read(path)
 
 
 def test_another_run_s_is_refused(path: Path) -> None:
     with pytest.raises(ValueError, match=r"checkpoint.pt: belongs to a run with other"):
-        checkpoint.load(path, "other")
+        load(path, "other")
 
 
 def test_a_failed_write_leaves_the_last_state(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -76,7 +84,7 @@ def test_a_failed_write_leaves_the_last_state(path: Path, monkeypatch: pytest.Mo
             with pytest.raises(OSError, match=r"checkpoint.pt"):
                 checkpoint.save(path, "key", {"x": torch.zeros(3)})
         assert os.listdir(path.parent) == ["checkpoint.pt"]
-        assert torch.equal(checkpoint.load(path, "key")["x"], STATE["x"])
+        assert torch.equal(load(path, "key")["x"], STATE["x"])
 
 
 def test_a_planted_link_is_neither_followed_nor_replaced(path: Path) -> None:
@@ -102,11 +110,39 @@ def test_the_fingerprint_tells_every_part_and_the_key_every_version_apart(monkey
 def test_a_refusal_says_what_differs(path: Path) -> None:
     parts = {"measurement": [np.zeros(3)], "members": [3], "seed": [0]}
     checkpoint.save(path, checkpoint.run_key(parts), STATE)
-    checkpoint.refuse_foreign(path, checkpoint.run_key(parts))
+    saved = checkpoint.Saved.read(path)
+    saved.refuse_foreign(checkpoint.run_key(parts))
     for others, told in (({"seed": [1]}, "seed"), ({"members": [4], "seed": [1]}, "members, seed")):
-        for refuse in (checkpoint.refuse_foreign, checkpoint.load):
+        for refuse in (saved.refuse_foreign, saved.state):
             with pytest.raises(ValueError, match=rf"checkpoint.pt: belongs to a run with another {told}; resume with"):
-                refuse(path, checkpoint.run_key(parts | others))
+                refuse(checkpoint.run_key(parts | others))
+
+
+def test_a_resumed_run_reads_it_once(
+    path: Path, box_recording: Callable[..., Recording], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is refused before any work, and what was read then is what the run goes on from."""
+    measured = box_recording(lambda points, t: 0.1 * np.cos(100 * points + t), nodes=4)
+    source, out = tmp_path / "m.h5", tmp_path / "out"
+    write_recording(source, measured)
+
+    class Patience:
+        def begins(self) -> None: ...
+        def frame_done(self, done: object) -> None: ...
+        def asked_to_stop(self) -> bool:
+            return True
+
+    with pytest.raises(Stopped):
+        torchsph.run_methods(
+            measured, ("ensemble",), members=2, checkpoints=out / "checkpoint.pt", watcher=Patience(), spacing=3e-3
+        )
+    reads: list[Path] = []
+    read_bytes = Path.read_bytes
+    monkeypatch.setattr(Path, "read_bytes", lambda self: reads.append(self) or read_bytes(self))
+    call = ["assimilate", str(source), "--members", "2", "--spacing", "0.003", "--out", str(out), "--resume", "--quiet"]
+    assert main(call) == 0
+    assert [one.name for one in reads if one.name == "checkpoint.pt"] == ["checkpoint.pt"]
+    assert not (out / "checkpoint.pt").exists() and (out / "analysis.h5").exists()
 
 
 def test_somebody_s_file_of_that_name_is_refused(path: Path) -> None:
@@ -117,7 +153,7 @@ def test_somebody_s_file_of_that_name_is_refused(path: Path) -> None:
         checkpoint.refuse_other_file(path)
     path.unlink()
     path.symlink_to(path.with_name("nowhere"))
-    for refuse in (checkpoint.refuse_other_file, checkpoint.refuse_damaged):
+    for refuse in (checkpoint.refuse_other_file, checkpoint.Saved.read):
         with pytest.raises(FileExistsError, match="symbolic link"):
             refuse(path)
 

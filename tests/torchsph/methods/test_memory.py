@@ -10,6 +10,8 @@ import pytest
 
 import geometry
 from torchsph import PreparedMeasurement, run_methods
+from torchsph.cli import main
+from torchsph.cli.commands import smooth
 from torchsph.methods import by_name
 from torchsph.methods.memory import MemoryPrediction, NotEnoughMemory, _control_group, free_memory
 
@@ -27,6 +29,24 @@ def test_what_does_not_fit_is_refused_before_any_work_with_the_setting_to_change
     monkeypatch.setattr(by_name, "free_memory", lambda: 10**6)
     with pytest.raises(NotEnoughMemory, match=r"only 1 MB are free"):
         run_methods(measured, ("spline",))
+
+
+def test_forecasts_and_splines_are_foretold_as_well(measured, tmp_path, monkeypatch, capsys):
+    with pytest.raises(NotEnoughMemory, match=r"needs about [\d.e+]+ GB .*try a larger --spacing"):
+        by_name.forecast_skill(measured, [0.01], spacing=2e-6)
+    plain, saved = (by_name.predicted_forecast_memory(measured, leads) for leads in ((), (0.01,)))
+    assert saved.recordings - plain.recordings == 2 * measured.velocity.astype(np.float32).nbytes
+    assert plain.splines == plain.members == 0 < plain.tables
+    path, out = tmp_path / "m.h5", tmp_path / "out.h5"
+    geometry.write_recording(path, measured)
+    for module in (by_name, smooth):
+        monkeypatch.setattr(module, "free_memory", lambda: 10**6)
+    for call in (
+        ["smooth", str(path), "--out", str(out)],
+        ["forecast", str(path), "--out", str(out), "--leads", "0.01"],
+    ):
+        assert main(call) == 3
+        assert f"{call[0]}: error: {path}: needs about" in capsys.readouterr().err and not out.exists()
 
 
 def test_the_largest_part_names_the_cure():

@@ -69,6 +69,18 @@ def test_the_same_seed_gives_the_same_particles():
     assert not torch.equal(start(seed=5).particles.position[:50], start(seed=6).particles.position[:50])
 
 
+def test_a_second_start_of_a_simulator_is_the_first_one_again_whatever_came_of_it():
+    simulator = Simulator(SCENE, preset("default"))
+    first = simulator.start(0.0, members=2, seed=3)
+    places = first.particles.position.clone()
+    first.particles.position.add_(0.1)
+    first.particles.velocity.fill_(0.1)
+    again = simulator.start(0.0, members=2, seed=3).particles
+    assert torch.equal(again.position, places) and not bool(again.velocity.any())
+    assert torch.equal(Simulator(SCENE, preset("default")).start(0.0, members=2, seed=3).particles.position, places)
+    assert not torch.equal(simulator.start(0.0, seed=4).particles.position, places[: len(places) // 2])
+
+
 def test_what_cannot_be_seeded_is_refused():
     with pytest.raises(ValueError, match="no particle of spacing 0.05 m fits"):
         Simulator(Scene(spacing=0.05, walls=BALL)).start(0.0)

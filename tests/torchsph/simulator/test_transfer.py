@@ -5,7 +5,8 @@ import math
 import pytest
 import torch
 
-from geometry import Grid
+from geometry import Grid, WallMotion, box
+from torchsph import Scene, Simulator
 from torchsph.pairs import choose_backend
 from torchsph.pairs.moving_least_squares import fetch_at
 from torchsph.pairs.registry import available_backends
@@ -118,3 +119,25 @@ def test_pulling_leaves_what_no_node_reaches_alone():
     gain = torch.ones(4, 4, 4)
     moved = pulled(points, velocity, grid, torch.zeros(3, 4, 4, 4), gain, gain)
     torch.testing.assert_close(moved, torch.tensor([[0.0] * 3, [2.0] * 3, [2.0] * 3]), atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_beyond_the_walls_a_node_has_what_flows_before_them(dtype):
+    """A shear v_y = 50 x ends at x = 10 mm: a node .6 mm farther out has .5 m/s, not the .53 of a slope carried on."""
+    spacing = 1e-3
+    scene = Scene(spacing=spacing, walls=WallMotion.at_rest(box((-0.01,) * 3, (0.01,) * 3, 2e-3)))
+    run = Simulator(scene, dtype=dtype).start(0.0)
+    grid = Grid.covering((-0.0106,) * 3, (0.0106,) * 3, 0.4e-3)
+    x, y, z = grid.nodes(dtype=torch.float64).T
+    velocity = torch.zeros((3, grid.size), dtype=torch.float64)
+    velocity[1] = 50.0 * x
+    everywhere = torch.ones(grid.shape, dtype=torch.bool)
+    run.impose(grid, velocity.reshape(3, *grid.shape), everywhere)
+    found = run.fetch(grid, everywhere)
+    value, middle = found.value[0, 1].flatten().double(), (y.abs() < 5e-3) & (z.abs() < 5e-3)
+    inside = middle & (x.abs() < 0.0099)
+    beyond = middle & (x > 0.0105)
+    assert int(beyond.sum()) > 100
+    assert bool(found.covered.flatten()[middle].all())
+    assert float((value - 50.0 * x)[inside].abs().max()) < 5e-3
+    assert float((value[beyond] - 0.5).abs().max()) < 0.01

@@ -6,6 +6,7 @@ import torch
 from ultrasound_cases import cube, packet
 
 from geometry import Grid
+from torchsph.ultrasound import IQPhase, SpeckleTracker, TrackingPlan, read_uff_recording
 from torchsph.ultrasound.acquisition import Beams
 from torchsph.ultrasound.uff import UffVolumes, read_uff, regular_grid, write_uff
 
@@ -60,3 +61,42 @@ def test_a_missing_file_and_a_packet_without_rates(tmp_path):
         read_uff(tmp_path / "none.uff")
     with pytest.raises(ValueError, match="frame_rate"):
         UffVolumes(np.zeros((2, 1, *GRID.shape), np.complex64), GRID).packet(Beams())
+
+
+def test_iq_of_a_file_becomes_a_recording_whatever_its_phase(tmp_path):
+    """As USTB leaves it, the carrier is still in: the packet is in baseband, and the flow is what it was."""
+    pytest.importorskip("pyuff_ustb")
+    plane = Grid((-3e-3, 21e-3), (1e-4, 1e-4), (61, 61))
+    scene = packet((0.1, 0.2), 0, grid=plane, beams=Beams((0.0, 1.0)), tissue=None)
+    depth = plane.nodes()[:, 1].reshape(plane.shape)
+    carrier = torch.polar(torch.ones_like(depth), scene.acquisition.phase_per_metre * depth).to(scene.iq)
+    write_uff(tmp_path / "iq.uff", UffVolumes((scene.iq * carrier)[:, None].numpy(), plane, 4000.0, 5e6), "iq")
+    found = read_uff(tmp_path / "iq.uff", "iq").packet(Beams((0.0, 1.0)))
+    assert found.phase is IQPhase.BASEBAND
+    torch.testing.assert_close(found.iq, scene.iq, atol=1e-4, rtol=1e-4)
+    plan = TrackingPlan(spacing=1e-3, images=8, tracker=SpeckleTracker(clutter=None))
+    recording = read_uff_recording(tmp_path / "iq.uff", "iq", plan=plan)
+    assert recording.frames == 2 and recording.wall is None
+    np.testing.assert_allclose(recording.time, [3.5 / 4000, 11.5 / 4000])
+    assert recording.grid.shape == (7, 7) and recording.grid.spacing == pytest.approx((1e-3, 1e-3))
+    inner = recording.weight[:, 2:-2, 2:-2] > 0
+    assert inner.mean() > 0.9
+    mean = np.moveaxis(recording.velocity[..., 2:-2, 2:-2], 1, -1)[inner].mean(axis=0)
+    np.testing.assert_allclose(mean, [0.1, 0.2], atol=0.01)
+
+
+def test_velocities_of_a_file_become_a_recording(tmp_path):
+    pytest.importorskip("pyuff_ustb")
+    velocity = np.random.default_rng(1).normal(scale=0.1, size=(3, 3, *GRID.shape)).astype(np.float32)
+    velocity[1, 0, 0, 0, 0] = np.nan
+    write_uff(tmp_path / "v.uff", UffVolumes(velocity, GRID, 50.0), "velocity")
+    recording = read_uff_recording(tmp_path / "v.uff", "velocity")
+    np.testing.assert_allclose(recording.time, [0, 0.02, 0.04])
+    np.testing.assert_array_equal(recording.velocity[0], velocity[0])
+    assert recording.weight.sum() == recording.weight.size - 1 and recording.weight[1, 0, 0, 0] == 0
+    write_uff(tmp_path / "one.uff", UffVolumes(velocity[:, :1], GRID, 50.0), "speed")
+    with pytest.raises(ValueError, match="1 channels of real values"):
+        read_uff_recording(tmp_path / "one.uff", "speed")
+    write_uff(tmp_path / "still.uff", UffVolumes(velocity, GRID), "velocity")
+    with pytest.raises(ValueError, match="no frame_rate"):
+        read_uff_recording(tmp_path / "still.uff", "velocity")

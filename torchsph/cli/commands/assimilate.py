@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import geometry
+from geometry.formats import write_sidecar
 from torchsph import data
 from torchsph.assimilation import filter_figure
 from torchsph.evaluation import figures, metrics
@@ -19,11 +20,12 @@ from torchsph.methods import by_name
 from torchsph.methods.runtime import checkpoint, parallel
 from torchsph.report import write_report
 
-from ..arguments import add_model_options, add_output_folder, add_seed, names, whole
+from ..arguments import add_model_options, add_output_folder, add_seed, add_sidecar, names, whole
 from ..checks import check_spacing, informative, usable_device
 from ..command import Command
 from ..outputs import output_folder, staged, write_json
 from ..printing import print_table, run_config, say
+from ..quantity_tables import CAUTION, QuantityTables, methods_read_out
 from ..running.folder_lock import locked
 from ..running.notes import shows_bar
 from ..running.provenance import provenance
@@ -61,6 +63,14 @@ def add_method_options(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--no-page", action="store_true", help="leave out report.html")
     add_seed(parser)
+    add_sidecar(parser)
+    parser.add_argument(
+        "--quantities",
+        action="store_true",
+        help="energy, pressure, flow rates ... without an ensemble too: of splines with draws from their posterior",
+    )
+    parser.add_argument("--no-quantities", action="store_true", help="leave out quantities.json, quantities.csv")
+    parser.add_argument("--keep-members", action="store_true", help="write the ensemble's members to DIR/members.h5")
 
 
 def assimilate(args: argparse.Namespace) -> None:
@@ -69,8 +79,9 @@ def assimilate(args: argparse.Namespace) -> None:
     Under torchrun the processes share the ensemble's simulations; the first one writes and prints.
     """
     measured_path, truth_path, methods = _inputs(args)
-    files = [f"{name}.h5" for name in methods]
-    files += ["analysis.h5", "report.png", "report.html", "filter.png", "metrics.json", "config.toml"]
+    files = [f"{name}{end}" for name in (*methods, "analysis") for end in (".h5", ".vtkhdf", "_wall.vtkhdf")]
+    files += ["members.h5", "quantities.json", "quantities.csv"]
+    files += ["report.png", "report.html", "filter.png", "metrics.json", "config.toml"]
     folder = output_folder(args.out, files)
     device = parallel.own_device(usable_device(args.device))
     lead = parallel.is_lead()
@@ -81,10 +92,11 @@ def assimilate(args: argparse.Namespace) -> None:
         also = [informative(geometry.read_recording(path), path) for path in args.also]
         truth = None if truth_path is None else geometry.read_recording(truth_path)
         check_spacing(args.spacing, measured)
+        read_out = methods_read_out(args, methods, measured)
         raw = metrics.evaluate(measured, truth, measured)  # first: a truth that does not fit must not cost a run
-        saved = folder / "checkpoint.pt"
+        saved, resume = folder / "checkpoint.pt", args.resume
         if "ensemble" in methods and lead:
-            _check_checkpoint(saved, args.resume)
+            resume = _kept(saved, args.resume)
         with parallel.joined():
             results = by_name.run_methods(
                 measured,
@@ -97,11 +109,13 @@ def assimilate(args: argparse.Namespace) -> None:
                 also=also,
                 truth=truth,
                 checkpoints=saved,
-                resume=args.resume,
+                resume=resume,
                 watcher=RunWatcher(signals, status),
                 seed=args.seed,
                 device=device,
                 progress=lead and shows_bar(args),
+                quantities=read_out,
+                keep_members=folder / "members.h5" if args.keep_members else None,
             )
         if not lead:
             return
@@ -113,14 +127,14 @@ def assimilate(args: argparse.Namespace) -> None:
             saved.unlink(missing_ok=True)  # the run is complete: there is nothing to go on with
 
 
-def _check_checkpoint(saved: Path, resume: bool) -> None:
-    """Refuse, before any work, a checkpoint that cannot be gone on from, and a file that one would replace."""
+def _kept(saved: Path, resume: bool) -> bool | checkpoint.Saved:
+    """What to go on from, refused before any work where it cannot be; also refused is a file that would be replaced."""
     if resume:
-        checkpoint.refuse_damaged(saved)
-        return
+        return checkpoint.Saved.read(saved) or True
     checkpoint.refuse_other_file(saved)
     if saved.exists():
         say(f"{saved}: an earlier run was interrupted; this one begins anew and replaces it (--resume goes on with it)")
+    return False
 
 
 def _write(
@@ -152,18 +166,28 @@ def _write(
     if truth is not None:
         claims = {name: metrics.spread_over_skill(recording, truth) for name, recording in analyses.items()}
         config["spread_over_skill"] = {name: claim.value for name, claim in claims.items() if claim is not None}
+    tables = None
+    if args.quantities or results[config["analysis"]].quantities is not None:
+        tables = QuantityTables.of(analyses[config["analysis"]], results[config["analysis"]].quantities, truth)
     with staged(folder) as scratch:
         for name, recording in analyses.items():
             geometry.write_recording(scratch / f"{name}.h5", recording, provenance=account | {"method": name})
         shutil.copyfile(scratch / f"{config['analysis']}.h5", scratch / "analysis.h5")
+        for name in () if args.no_sidecar else (*analyses, "analysis"):
+            write_sidecar(scratch / f"{name}.h5", analyses[config["analysis"] if name == "analysis" else name])
         figures.draw_report(scratch / "report.png", measured, analyses, scores, truth, seconds)
         if "ensemble" in results:
             filter_figure(results["ensemble"].info["filter"]).savefig(scratch / "filter.png", dpi=110)
         write_config(scratch, args)
         write_json(scratch / "metrics.json", metrics_document(measured, scores, seconds, config))
+        if tables is not None:
+            tables.write(scratch, {key: value for key, value in config.items() if key != "info"})
         if not args.no_page:
             _write_page(scratch, measured, truth, results, scores, config)
     print_table(figures.scores_table(scores, seconds))
+    if tables is not None:
+        print_table(tables.table())
+        say(CAUTION)
     for words in results["ensemble"].info["filter"]["warnings"] if "ensemble" in results else ():
         say(f"ensemble: {words}")
     files = ", ".join(f"{name}.h5" for name in analyses)

@@ -121,6 +121,7 @@ def summary_table(recording: geometry.Recording) -> list[list[str]]:
         "quality",
         "beam",
         "pressure",
+        "pressure_sigma",
         "volume",
         "flux_mitral",
         "flux_aortic",

@@ -6,10 +6,14 @@ import argparse
 
 import geometry
 from torchsph.evaluation import figures, metrics
-from torchsph.methods.measurement.frame_splines import smooth as smooth_recording
+from torchsph.methods.by_name import predicted_memory
+from torchsph.methods.measurement.prepared import PreparedMeasurement
+from torchsph.methods.memory import free_memory
 
+from ..arguments import add_sidecar
 from ..checks import full_vectors, informative, output_file
 from ..command import Command
+from ..outputs import write_analysis
 from ..printing import print_table, say
 from ..running.notes import shows_bar
 from ..running.provenance import provenance
@@ -18,15 +22,19 @@ from ..running.provenance import provenance
 def _arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("measurement", metavar="MEASUREMENT.h5")
     parser.add_argument("--out", required=True, metavar="SMOOTH.h5", help="the smoothed recording")
+    add_sidecar(parser)
 
 
 def smooth(args: argparse.Namespace) -> None:
     """`torchsph smooth`: a B-spline field for each frame."""
     path = output_file(args.out)
     measured = full_vectors(geometry.read_recording(args.measurement), args.measurement)
-    informative(measured, args.measurement, weighed=False)
-    smoothed = smooth_recording(measured, progress=shows_bar(args))
-    geometry.write_recording(path, smoothed, provenance=provenance(args, {"measurement": args.measurement}))
+    informative(measured, args.measurement)
+    prepared = PreparedMeasurement(measured, progress=shows_bar(args))
+    predicted_memory(prepared, ("spline",)).refuse_beyond(free_memory())
+    smoothed = prepared.smoothed
+    account = provenance(args, {"measurement": args.measurement})
+    write_analysis(path, smoothed, account, sidecar=not args.no_sidecar)
     scores = {name: metrics.evaluate(one, None, measured) for name, one in (("raw", measured), ("spline", smoothed))}
     print_table(figures.scores_table(scores, {}))
     say(f"wrote {len(smoothed.time)} frames to {path}")

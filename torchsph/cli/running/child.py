@@ -7,13 +7,15 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 from torchsph.methods.runtime.watching import Stopped
 
 from ..exit_codes import ExitCode
+from .stopping import SIGNALS
 
 # s that a child has to end after it was asked to, before it is killed
 GRACE = 60.0
@@ -49,10 +51,14 @@ def run_child(arguments: Sequence[str], log: Path, limit: float | None = None) -
     try:
         start = os.fstat(handle).st_size
         call = [sys.executable, "-m", "torchsph", *arguments]
-        process = subprocess.Popen(call, stdin=subprocess.DEVNULL, stdout=handle, stderr=handle)
         late = False
+        came: list[int] = []
+        with _held(came):
+            process = subprocess.Popen(call, stdin=subprocess.DEVNULL, stdout=handle, stderr=handle)
         try:
             try:
+                for number in came:
+                    signal.raise_signal(number)
                 status = process.wait(limit)
             except subprocess.TimeoutExpired:
                 late, status = True, _ended(process, signal.SIGTERM)
@@ -71,6 +77,22 @@ def run_child(arguments: Sequence[str], log: Path, limit: float | None = None) -
     if status == -signal.SIGKILL:
         return Outcome(ExitCode.MEMORY, seconds, f"was killed ({name}), most likely because memory ran out")
     return Outcome(ExitCode.OURS, seconds, f"crashed ({name})")
+
+
+@contextmanager
+def _held(came: list[int]) -> Iterator[None]:
+    """Keep requests to stop in ``came`` meanwhile: one that struck amid the start of a child would leave it behind."""
+    before = {}
+    try:
+        for one in (*SIGNALS, signal.SIGINT):
+            before[one] = signal.signal(one, lambda number, frame: came.append(number))
+    except ValueError:  # not in the main thread: no signal strikes here
+        pass
+    try:
+        yield
+    finally:
+        for one, handler in before.items():
+            signal.signal(one, signal.SIG_DFL if handler is None else handler)
 
 
 def _ended(process: subprocess.Popen[bytes], by: signal.Signals) -> int:

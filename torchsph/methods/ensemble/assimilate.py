@@ -28,7 +28,9 @@ from torchsph.simulator.transfer.checks import check_grid
 from ..between_frames import BetweenFrames, FlowAt
 from ..measurement.observation_operator import Measurement
 from ..measurement.prepared import PreparedMeasurement
+from ..members.frames import FrameObserver
 from ..runtime import checkpoint
+from ..runtime.checkpoint import Saved
 from ..runtime.parallel import anywhere
 from ..runtime.watching import FrameDone, Stopped, Watcher
 from .accounts import accounts_of
@@ -75,10 +77,11 @@ def assimilate(
     also: Sequence[geometry.Recording | PreparedMeasurement] = (),
     truth: geometry.Recording | None = None,
     checkpoints: str | Path | None = None,
-    resume: bool = False,
+    resume: bool | Saved = False,
     watcher: Watcher | None = None,
     seed: int = 0,
     progress: bool = False,
+    observers: Sequence[FrameObserver] = (),
 ) -> EnsembleRun:
     """Assimilate measurements into an ensemble of SPH simulations, as this module's docstring says.
 
@@ -92,11 +95,13 @@ def assimilate(
             the forecast at its own time and enters the next analysis.
         truth: for the scores in the record alone. It never enters an analysis.
         checkpoints: file to which every cycle writes its state.
-        resume: go on from it where it is there.
+        resume: go on from it where it is there; or the checkpoint itself, where it was read already.
         watcher: is told of every frame, and may ask the run to stop; in one process or in all of them.
         seed: of everything random. Under ``torch.distributed`` the processes share the simulations; the result is the
             same for any number of them.
         progress: show a bar.
+        observers: what is done with every frame, its members and accelerations, as the first process has them; not
+            with a lag, which changes analyses after their time.
 
     Returns:
         The analyses, with their claimed deviation and the accounts of the run.
@@ -112,6 +117,10 @@ def assimilate(
     if resume and checkpoints is None:
         raise ValueError("resume needs the file of checkpoints that the run before wrote")
     options = EnsembleOptions() if options is None else options
+    if observers and options.lag is not None:
+        raise ValueError(
+            "members are followed without a lag alone: later data change the analyses that they lie around"
+        )
     coarse = model if coarse is None else coarse
     given = measured if isinstance(measured, geometry.Recording) else measured.recording
     for one in (model, coarse):
@@ -124,18 +133,20 @@ def assimilate(
     filter = default_filter(first.recording, options) if filter is None else filter
     key = ensemble_key(prepared, model, coarse, filter, options, members=members, seed=seed, truth=truth)
     path = None if checkpoints is None else Path(checkpoints)
-    if resume and path is not None:
-        checkpoint.refuse_foreign(path, key)  # before the splines and error models that the cycle begins with
+    saved = Saved.read(path) if resume is True and path is not None else resume or None
+    if saved is not None:
+        saved.refuse_foreign(key)  # before the splines and error models that the cycle begins with
     cycle = Cycle(
         [Measurement(each, grid, options.kernel) for each in prepared],
-        Forecaster(model, coarse, grid, options.transfer, batch=options.batch, seed=seed),
+        Forecaster(model, coarse, grid, options.transfer, batch=options.batch, seed=seed, motion=bool(observers)),
         filter,
         options,
         members=members,
         truth=truth,
         seed=seed,
+        observers=observers,
     )
-    state = checkpoint.load(path, key) if resume and path is not None else None
+    state = checkpoint.shared_state(saved, key) if resume else None
     if state is not None:
         cycle.restore(state)
     _run(cycle, path, key, progress, watcher)

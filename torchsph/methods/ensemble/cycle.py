@@ -17,6 +17,7 @@ from torchsph.simulator.failures import NumericalFailure
 
 from ..measurement.observation_batch import Part, gathered
 from ..measurement.observation_operator import Measurement
+from ..members.frames import FrameObserver, MemberFrames
 from ..runtime.parallel import forked, from_last, is_last, shared
 from .analyser import Analyser
 from .analyses import Analyses
@@ -37,6 +38,7 @@ class Cycle:
         members: N.
         truth: for the record's scores alone; it never enters an analysis.
         seed: of everything random.
+        observers: what is done with every frame and its members; none: nothing more is computed or held.
 
     Attributes:
         alive: members that lived through the last forecast.
@@ -55,6 +57,7 @@ class Cycle:
         members: int,
         truth: geometry.Recording | None = None,
         seed: int = 0,
+        observers: Sequence[FrameObserver] = (),
     ) -> None:
         self.measurements, self.forecaster = list(measurements), forecaster
         self.options, self.count = options, members
@@ -68,6 +71,7 @@ class Cycle:
             self.measurements, filter_, options, self.generator, self.analyses, truth=truth, seed=seed
         )
         self.forecast_spread = ForecastSpread(measurements[0], options, members, self.generator, self.analyses)
+        self.member_frames = MemberFrames(self.measured, observers) if observers else None
         self._ensemble: Ensemble | None = None
         self.alive = members
 
@@ -94,7 +98,15 @@ class Cycle:
         parameters = {one.parameter.name: one.draw(self.count, self.generator) for one in self.options.estimated}
         self._ensemble = Ensemble(control, control + draws, parameters).centred()
         sigma = torch.where(mask, self.ensemble.members.std(0), 0.0)
-        self.analyses.add(self.ensemble, control, sigma, first_codes(self.measurements[0], mask), 0)
+        self._add(control, sigma, first_codes(self.measurements[0], mask), 0)
+
+    def _add(self, control: Tensor, sigma: Tensor, quality: Tensor, missing: int) -> None:
+        """The next frame's analysis (``Analyses.add``), and its members to those who look on."""
+        self.analyses.add(self.ensemble, control, sigma, quality, missing)
+        if self.member_frames is not None:
+            self.member_frames.analysed(self.done - 1, self.analyses.fields[-1], self.ensemble.members)
+            if self.done == self.measured.frames:
+                self.member_frames.finish()
 
     def _first(self, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """The first control (D, *shape), and deviations of the members (N, D, *shape)."""
@@ -122,6 +134,9 @@ class Cycle:
         forecasts = self.forecaster.advance(self.ensemble, before, early, times, masks)
         self._count_alive(forecasts.failed, now)
         self.analyses.shocks.append(forecasts.shock)
+        if self.member_frames is not None and forecasts.rates is not None and forecasts.pressure is not None:
+            rates = forecasts.rates
+            self.member_frames.forecast(rates.control, rates.members, forecasts.failed, forecasts.pressure)
         states = self.forecast_spread.prepared(forecasts, from_last(noise), frame, self.analyser.spread_match.factor)
         missing = int((late & ~forecasts.covered).sum())
         parts = [Part(measurement, what, _nearest(times, time)) for measurement, what, time in seen]
@@ -136,7 +151,7 @@ class Cycle:
             self._ensemble, sigma = self.analyser.analyse(states[-1], batch, frame)
             reason = self.analyser.reason
         quality = analysed_codes([] if batch is None else batch.parts, reason, late, forecasts.covered, self.grid)
-        self.analyses.add(self.ensemble, torch.where(late, self.ensemble.control, 0.0), sigma, quality, missing)
+        self._add(torch.where(late, self.ensemble.control, 0.0), sigma, quality, missing)
 
     def _count_alive(self, failed: Tensor, time: float) -> None:
         """Count the members that are not among the failed (N,); refuse to go on where too few are left."""
@@ -159,6 +174,7 @@ class Cycle:
             "generator": self.generator.get_state(),
             "analyser": self.analyser.state(),
             "analyses": self.analyses.state(),
+            **({} if self.member_frames is None else {"member frames": self.member_frames.state()}),
         }
 
     def restore(self, state: dict[str, Any]) -> None:
@@ -167,6 +183,10 @@ class Cycle:
         self.generator.set_state(state["generator"])
         self.analyser.restore(state["analyser"])
         self.analyses.restore(state["analyses"])
+        if self.member_frames is not None:
+            if "member frames" not in state:
+                raise ValueError("the checkpoint holds no members; start anew, or go on without --keep-members")
+            self.member_frames.restore(state["member frames"])
 
 
 def _nearest(times: list[float], time: float) -> int:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -20,6 +21,7 @@ from torchsph.assimilation import gather_members
 from torchsph.simulator.failures import NumericalFailure
 from torchsph.simulator.grid_forecast import GridForecast, Transfer
 from torchsph.simulator.simulator import Simulator
+from torchsph.simulator.transfer.pressure_fetching import PressureAverages
 
 
 @dataclass(frozen=True)
@@ -52,6 +54,9 @@ class Forecasts:
         control_failed: the members' mean then stands for the control.
         steps: of all runs of this process together.
         shock: what the projection had to take from the control's start, relative (``GridForecast.shock``).
+        rates: mean du/dt over the interval, m/s^2, NaN where unknown, where they were asked for.
+        pressure: (2, *shape), Pa, of the control, averaged over the first and the last half of the interval, up to a
+            constant each; NaN where unknown. Where it was asked for.
     """
 
     states: list[Ensemble]
@@ -60,14 +65,20 @@ class Forecasts:
     control_failed: bool
     steps: int
     shock: float
+    rates: Ensemble | None = None
+    pressure: Tensor | None = None
 
 
 class Control(NamedTuple):
-    """The control's run: (times, D, *shape), NaN where it failed; (*shape) what it covers at the end; its shock."""
+    """The control's run: (times, D, *shape), NaN where it failed; (*shape) what it covers at the end; its shock.
+
+    With motion its rate is the last of the fields, and ``pressure`` (2, *shape) is there.
+    """
 
     fields: Tensor
     covered: Tensor
     shock: float
+    pressure: Tensor | None = None
 
 
 def shares(members: int, control_cost: float, processes: int, batch: int = 1) -> list[tuple[bool, slice]]:
@@ -94,6 +105,8 @@ class Forecaster:
         transfer: how grid forecasts are made.
         batch: members that are simulated together. They share the search of neighbours, whose times decide on the last
             digits of their sums: with the same batches the same bits result, whatever process runs them.
+        seed: of the particles.
+        motion: hand back rates and the control's pressure as well.
     """
 
     def __init__(
@@ -105,10 +118,11 @@ class Forecaster:
         *,
         batch: int = 8,
         seed: int = 0,
+        motion: bool = False,
     ) -> None:
         if batch < 1:
             raise ValueError(f"a batch needs at least one member, got {batch}")
-        self.batch = batch
+        self.batch, self.motion = batch, motion
         self.model, self.coarse, self.grid, self.transfer, self.seed = model, coarse, grid, transfer, seed
         ratio = coarse.scene.spacing / model.scene.spacing
         self.control_cost = ratio ** (grid.dimension + 1)  # so many more particles, and so much shorter steps
@@ -130,7 +144,8 @@ class Forecaster:
         if lead:
             own, more = self._control(ensemble, *here)
             steps += more
-        fields, (control, covered, shock) = self._gathered(ensemble, run[0], own, len(times), todo)
+        fields, (control, covered, shock, pressure) = self._gathered(ensemble, run[0], own, todo)
+        fields, control, rates = self._parted(fields, control, len(times))
         failed = ~torch.isfinite(fields).flatten(2).all(2).all(0)
         lost = not bool(torch.isfinite(control).all())
         if lost:
@@ -138,7 +153,13 @@ class Forecaster:
                 raise NumericalFailure(f"the control and all {count} members failed after {start:g} s")
             control = fields[:, ~failed].mean(1)
         states = [Ensemble(control[k], fields[k], ensemble.parameters) for k in range(len(times))]
-        return Forecasts(states, covered, failed, lost, steps, shock)
+        return Forecasts(states, covered, failed, lost, steps, shock, rates, pressure)
+
+    def _parted(self, fields: Tensor, control: Tensor, times: int) -> tuple[Tensor, Tensor, Ensemble | None]:
+        """What ``_run`` has put behind one another: members (times, N, ...), control (times, ...) and their rates."""
+        if not self.motion:
+            return fields, control, None
+        return fields[:times], control[:times], Ensemble(control[times], fields[times])
 
     def _members(
         self,
@@ -150,12 +171,12 @@ class Forecaster:
         masks: Sequence[Tensor],
     ) -> tuple[Tensor, int]:
         """(times, k, D, *shape) of this process's members, NaN where one failed; and the steps taken."""
-        done = [ensemble.members.new_zeros((len(times), 0, *ensemble.control.shape))]
+        done = [ensemble.members.new_zeros((len(times) + self.motion, 0, *ensemble.control.shape))]
         total = 0
         for first in range(mine.start, mine.stop, self.batch):
             these = slice(first, min(first + self.batch, mine.stop))
             parameters = {name: row[these] for name, row in ensemble.parameters.items()}
-            found, _, failed, _, steps = self._run(
+            found, _, failed, _, steps, _ = self._run(
                 self.coarse, ensemble.members[these], parameters, start, mask, times, masks
             )
             done.append(torch.where(failed.reshape(1, -1, *[1] * (found.ndim - 2)), torch.nan, found))
@@ -167,10 +188,15 @@ class Forecaster:
     ) -> tuple[Control, int]:
         """The control's own run, and its steps."""
         middle = {name: row.mean()[None] for name, row in ensemble.parameters.items()}
-        found, covered, failed, shock, steps = self._run(
-            self.model, ensemble.control[None], middle, start, mask, times, masks
+        halves = None
+        if self.motion:
+            middle_time = 0.5 * (start + times[-1])
+            halves = PressureAverages(self.grid, [mask, masks[-1]], [(start, middle_time), (middle_time, times[-1])])
+        found, covered, failed, shock, steps, pressure = self._run(
+            self.model, ensemble.control[None], middle, start, mask, times, masks, halves
         )
-        return Control(torch.where(failed[0], torch.nan, found[:, 0]), covered[0], float(shock[0])), steps
+        fields = torch.where(failed[0], torch.nan, found[:, 0])
+        return Control(fields, covered[0], float(shock[0]), None if pressure is None else pressure[0]), steps
 
     def _run(
         self,
@@ -181,11 +207,18 @@ class Forecaster:
         mask: Tensor,
         times: Sequence[float],
         masks: Sequence[Tensor],
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor, int]:
-        """Grids (times, k, D, *shape), covered (k, *shape), failed (k,), shocks (k,) and the steps taken."""
+        averages: PressureAverages | None = None,
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor, int, Tensor | None]:
+        """Grids (times, k, D, *shape), covered (k, *shape), failed (k,), shocks (k,), steps taken and pressures.
+
+        With motion the rates follow the grids.
+        """
+        known, motion = mask.to(model.device), self.motion
         going = GridForecast(
-            model, self.grid, states.to(model.device), mask.to(model.device), start, self.transfer, seed=self.seed
+            model, self.grid, states.to(model.device), known, start, self.transfer, seed=self.seed, rates=motion
         )
+        if averages is not None:
+            going.run.observers.append(partial(averages.note, going.run))
         if parameters:
             going.run.change(**{name: row.to(torch.float32) for name, row in parameters.items()})
         found, record = [], going.run.record
@@ -194,14 +227,15 @@ class Forecaster:
             for time, where in zip(times, masks, strict=True):
                 value, covered = going.at(time, where.to(model.device))
                 found.append(value.cpu().to(torch.float32))
+            if self.motion:
+                found.append(going.rate().cpu().to(torch.float32))
         except NumericalFailure:  # nobody is left; what was fetched before stays unused as well
-            found = [torch.full_like(states, torch.nan)] * len(times)
-        steps = int(record.steps.sum())
-        return torch.stack(found), covered.cpu(), record.failed.cpu(), going.shock, steps
+            found = [torch.full_like(states, torch.nan)] * (len(times) + self.motion)
+        steps, pressure = int(record.steps.sum()), None if averages is None else averages.fields(len(states))
+        return torch.stack(found), covered.cpu(), record.failed.cpu(), going.shock, steps, pressure
 
-    @staticmethod
     def _gathered(
-        ensemble: Ensemble, members: Tensor, control: Control | None, times: int, todo: list[tuple[bool, slice]]
+        self, ensemble: Ensemble, members: Tensor, control: Control | None, todo: list[tuple[bool, slice]]
     ) -> tuple[Tensor, Control]:
         """All members (times, N, ...) and the control's run, the same in every process.
 
@@ -209,20 +243,23 @@ class Forecaster:
             ensemble: before the forecast.
             members: (times, k, ...) of this process.
             control: in the process that ran it.
-            times: their number.
             todo: who ran what (``shares``).
         """
         if len(todo) == 1 and control is not None:
             return members, control
         counts = [part.stop - part.start for _, part in todo]
         everyone = gather_members(members.transpose(0, 1), counts).transpose(0, 1)
-        shape = (times, *ensemble.control.shape)
+        shape = (len(members), *ensemble.control.shape)
+        nodes, halves = ensemble.control[0].numel(), 2 if self.motion else 0
         if control is None:
             control = Control(torch.empty(shape), torch.empty(shape[2:], dtype=torch.bool), 0.0)
-        field, covered, shock = control
-        packed = torch.cat([field.flatten(), covered.to(field).flatten()]).double()
-        packed = torch.cat([packed, torch.tensor([shock], dtype=torch.float64)])
+        field, covered, shock, pressure = control
+        if pressure is None:
+            pressure = torch.empty((halves, *shape[2:]))
+        parts = [field.flatten(), covered.flatten(), pressure.flatten(), torch.tensor([shock], dtype=torch.float64)]
+        packed = torch.cat([part.double() for part in parts])
         dist.broadcast(packed, 0)
         size = field.numel()
-        field = packed[:size].to(field).reshape(shape)
-        return everyone, Control(field, packed[size:-1].reshape(shape[2:]) > 0.5, float(packed[-1]))
+        field, where = packed[:size].to(field).reshape(shape), packed[size : size + nodes].reshape(shape[2:]) > 0.5
+        pressure = packed[size + nodes : -1].to(pressure).reshape(halves, *shape[2:])
+        return everyone, Control(field, where, float(packed[-1]), pressure if self.motion else None)

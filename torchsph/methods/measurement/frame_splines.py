@@ -18,7 +18,7 @@ from regularize.solvers.factor import Factor
 
 from ..runtime.parallel import shared
 from .flux_data import with_fluxes
-from .informative import refuse_silent
+from .informative import refuse_exact, refuse_silent
 from .wall_rows import at_knots, mean_certainty, open_regions, wall_rows
 from .wall_trust import wall_trust
 
@@ -56,6 +56,7 @@ class FrameSmoother:
         if choose_every < 1:
             raise ValueError(f"choose_every must be at least 1, got {choose_every}")
         refuse_silent(recording)
+        refuse_exact(recording)
         self.estimates = geometry.estimated(recording) if estimates is None else estimates
         recording = self.estimates.recording
         self.type = geometry.measurement_type(recording)
@@ -324,6 +325,9 @@ def smooth(
 
     Returns:
         A recording on the measurement's grid, mask and times.
+
+    Raises:
+        RecordingError: nothing was measured, or an error is stated as 0.
     """
     frames = FrameSmoother(measured, regularize.Smoother() if smoother is None else smoother)
     frames.warn()

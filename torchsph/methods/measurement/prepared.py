@@ -11,7 +11,6 @@ import regularize
 
 from .error_model import ObservationError, estimate_error
 from .frame_splines import FrameSmoother, smooth_frames
-from .informative import refuse_exact
 
 
 class PreparedMeasurement:
@@ -44,7 +43,6 @@ class PreparedMeasurement:
     ) -> None:
         if splines is not None and smoother is not None:
             raise ValueError("PreparedMeasurement takes a smoother or splines, which have one already, not both")
-        refuse_exact(recording)
         self.progress = progress
         if splines is None:
             splines = FrameSmoother(recording, regularize.Smoother() if smoother is None else smoother)

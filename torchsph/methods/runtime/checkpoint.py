@@ -6,6 +6,7 @@ import hashlib
 import io
 import sys
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -53,39 +54,12 @@ def save(path: Path, key: str, state: dict[str, Any]) -> None:
     write_whole(path, b"%b%b\n%b" % (_OPENING, hashlib.sha256(body).hexdigest().encode(), body))
 
 
-def refuse_damaged(path: Path) -> None:
-    """Refuse a checkpoint that is cut, changed or none at all, before any work is done.
-
-    Args:
-        path: of the file, which need not be there.
-
-    Raises:
-        ValueError: it cannot be gone on from.
-        FileExistsError: it is a link or a device, which no checkpoint would be written to.
-    """
-    refuse_special(path)
-    if path.exists():
-        _verified(path)
-
-
-def refuse_foreign(path: Path, key: str) -> None:
-    """Refuse a checkpoint of another run, as ``load`` does, without loading it.
-
-    Raises:
-        ValueError: it is damaged, or was written by another run.
-        FileExistsError: as ``refuse_damaged``.
-    """
-    refuse_special(path)
-    if path.exists():
-        _packed(path, key)
-
-
 def refuse_other_file(path: Path) -> None:
     """Refuse to begin a run whose checkpoints would take the place of a file that is none.
 
     Raises:
         ValueError: it is somebody's file.
-        FileExistsError: as ``refuse_damaged``.
+        FileExistsError: it is a link or a device, which no checkpoint would be written to.
     """
     refuse_special(path)
     if not path.exists():
@@ -96,17 +70,64 @@ def refuse_other_file(path: Path) -> None:
         raise ValueError(f"{path}: is no checkpoint, and would be replaced by one; move it, or choose another --out")
 
 
-def load(path: Path, key: str) -> dict[str, Any] | None:
-    """The state in ``path``, or None where there is none; of several processes the first reads for all.
+@dataclass(frozen=True)
+class Saved:
+    """A checkpoint that was read, once: every bit of it is the one that was written.
+
+    Attributes:
+        path: of the file.
+        key: of the run that wrote it.
+        packed: its state, as torch has packed it.
+    """
+
+    path: Path
+    key: str
+    packed: bytes = field(repr=False)
+
+    @classmethod
+    def read(cls, path: Path) -> Saved | None:
+        """The checkpoint in ``path``, refused before any work is done where it is cut or changed; None: there is none.
+
+        Raises:
+            ValueError: it cannot be gone on from.
+            FileExistsError: it is a link or a device, which no checkpoint would be written to.
+        """
+        refuse_special(path)
+        return cls(path, *_verified(path)) if path.exists() else None
+
+    def refuse_foreign(self, key: str) -> None:
+        """Refuse to go on with it in another run.
+
+        Raises:
+            ValueError: it was written with other options, members, seed or recordings.
+        """
+        if self.key != key:
+            differing = _differing(self.key, key)
+            other = f"another {differing}" if differing else "other recordings, options, members, seed or version"
+            raise ValueError(
+                f"{self.path}: belongs to a run with {other}; resume with the same, or remove it and start anew"
+            )
+
+    def state(self, key: str) -> dict[str, Any]:
+        """The state that was saved, for the run of that key.
+
+        Raises:
+            ValueError: as ``refuse_foreign``.
+        """
+        self.refuse_foreign(key)
+        return torch.load(io.BytesIO(self.packed), weights_only=True)
+
+
+def shared_state(saved: Saved | None, key: str) -> dict[str, Any] | None:
+    """The state of a checkpoint, or None without one; of several processes the first has read it for all.
 
     Raises:
-        ValueError: it is damaged, or was written by another run: other options, members, seed or recordings.
+        ValueError: it was written by another run.
     """
     held: list[dict[str, Any] | ValueError | None] = [None]
-    lead = not dist.is_initialized() or dist.get_rank() == 0
-    if lead and path.exists():
+    if saved is not None and (not dist.is_initialized() or dist.get_rank() == 0):
         try:
-            held = [_state(path, key)]
+            held = [saved.state(key)]
         except ValueError as fault:  # told to all processes, which would wait for this one else
             held = [fault]
     if dist.is_initialized():
@@ -115,21 +136,6 @@ def load(path: Path, key: str) -> dict[str, Any] | None:
     if isinstance(found, ValueError):
         raise found
     return found
-
-
-def _state(path: Path, key: str) -> dict[str, Any]:
-    """The state of this run."""
-    return torch.load(io.BytesIO(_packed(path, key)), weights_only=True)
-
-
-def _packed(path: Path, key: str) -> bytes:
-    """The state of this run as torch has packed it."""
-    written, packed = _verified(path)
-    if written != key:
-        differing = _differing(written, key)
-        other = f"another {differing}" if differing else "other recordings, options, members, seed or version"
-        raise ValueError(f"{path}: belongs to a run with {other}; resume with the same, or remove it and start anew")
-    return packed
 
 
 def _differing(written: str, key: str) -> str:

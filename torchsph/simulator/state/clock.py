@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from typing import Protocol
 
 import torch
@@ -55,14 +56,21 @@ class Clock:
     def at(self, times: Tensor | float) -> None:
         """Set the present time of the members, s: (members,) float64 or one for all."""
         self.times = torch.as_tensor(times, dtype=torch.float64, device=self._device)
-        self._mean: float | None = None
+        self._first: float | None = None
 
     @property
-    def mean(self) -> float:
-        """Present time, s, on the average over the members."""
-        if self._mean is None:
-            self._mean = float(self.times.mean())
-        return self._mean
+    def first(self) -> float:
+        """Present time of the first member, s, which stands for all where their openings are in the same place."""
+        if self._first is None:
+            self._first = float(self.times.reshape(-1)[0])
+        return self._first
+
+    def seen_by(self, group: Tensor) -> Clock:
+        """The clock for some members, (members,) bool; the others stand at the time of the first of them."""
+        other = copy(self)
+        if self.times.ndim:
+            other.at(torch.where(group, self.times, self.times[group][0]))
+        return other
 
     def of_members(self, members: int) -> Tensor:
         """Present time of each member, s, (members,) float64."""

@@ -89,6 +89,23 @@ def check_weight(name: str, weight: Tensor, grid: Grid, most: float | None = Non
         raise ValueError(f"{name} must be {rule}, but is {float(weight[node]):g} at {node} (array order)")
 
 
+def check_some(name: str, weight: Tensor, cure: str, mask: Tensor | None = None) -> None:
+    """Refuse weights that are 0 wherever they count, with which nothing would be done.
+
+    Args:
+        name: what they are called.
+        weight: (*shape), not negative.
+        cure: what to do instead.
+        mask: (*shape) bool, where they count; None: everywhere.
+
+    Raises:
+        ValueError: none is positive.
+    """
+    if not bool((weight > 0).any() if mask is None else ((weight > 0) & mask.to(weight.device)).any()):
+        where = "at every node" if mask is None else "at every node of the mask"
+        raise ValueError(f"{name} is 0 {where}, so nothing is known anywhere; {cure}")
+
+
 def _check_real(name: str, array: Tensor) -> None:
     _check_tensor(name, array)
     if not array.is_floating_point():

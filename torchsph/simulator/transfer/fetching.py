@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
 
@@ -17,7 +19,13 @@ FETCH_RADIUS = 2.0
 
 
 def fetch_on_grid(
-    particles: Particles, grid: Grid, mask: Tensor, units: Units, backend: Backend, period: Tensor | None
+    particles: Particles,
+    grid: Grid,
+    mask: Tensor,
+    units: Units,
+    backend: Backend,
+    period: Tensor | None,
+    nearest_fluid: Callable[[Tensor], Tensor] | None = None,
 ) -> Fetched:
     """Velocities of all members at some nodes of a grid.
 
@@ -28,6 +36,8 @@ def fetch_on_grid(
         units: internal units.
         backend: for the sums over neighbours.
         period: (D,), internal, of the periodic box, or None.
+        nearest_fluid: gives for points (n, D), internal, those where there is fluid. A node beyond the walls gets what
+            flows before them: a slope carried on from one side is wrong there by more than the velocity itself.
 
     Returns:
         ``value`` (members, D, *shape), m/s, 0 where nothing is known, and ``covered`` (members, *shape) bool.
@@ -35,7 +45,10 @@ def fetch_on_grid(
     members, dimension = particles.members, grid.dimension
     node = torch.nonzero(mask.reshape(-1)).squeeze(1)
     points = grid.nodes(dtype=torch.float64, device=particles.position.device)[node] / units.length
-    points = points.to(particles.position.dtype).repeat(members, 1)
+    points = points.to(particles.position.dtype)
+    if nearest_fluid is not None:
+        points = nearest_fluid(points)
+    points = points.repeat(members, 1)
     owner = torch.arange(members, device=particles.member.device).repeat_interleave(len(node))
     found = fetch_at(
         backend,

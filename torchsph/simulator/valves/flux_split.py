@@ -113,7 +113,7 @@ def _reconciled(openings: Openings, found: dict[int, Tensor], rest: Tensor, cloc
         regions = ", ".join(str(openings.valve(number).region) for number in found)
         missing = float(rest.abs().max()) * openings.flux_unit
         raise ValueError(
-            f"at {clock.mean:.4g} s the fluxes given for region {regions} miss the change of the cavity's volume by "
+            f"at {clock.middle:.4g} s the fluxes given for region {regions} miss the change of the cavity's volume by "
             f"{missing:.3g} m^3/s, and no open valve takes what they leave: open one without a flux, or say by "
             "flux_sigma that they are uncertain"
         )

@@ -81,9 +81,12 @@ class ValveModel:
         return particles
 
     def exchange(
-        self, particles: Particles, clock: Clock, record: Record, pressure: Pressure
+        self, particles: Particles, clock: Clock, record: Record, pressure: Pressure, stepping: Tensor
     ) -> tuple[Particles, bool]:
-        """Particles, those that have crossed an opening noted and changed; True where they were renumbered."""
+        """Particles, those that have crossed an opening noted and changed; True where they were renumbered.
+
+        Only the members ``stepping`` (members,) bool are looked at: the others wait for them at the interval's end.
+        """
         return particles, False
 
     def finished(
@@ -93,7 +96,10 @@ class ValveModel:
         return particles
 
     def beyond(self, position: Tensor, clock: Clock) -> Tensor:
-        """(n,) bool: points (n, D) at an open valve or behind it, where the walls' distance knows no end."""
+        """(n,) bool: points (n, D) at an open valve or behind it, where the walls' distance knows no end.
+
+        Of the middle of the interval, an instant that all members have in common.
+        """
         return torch.zeros_like(position[:, 0], dtype=torch.bool)
 
     def imposing_points(self, particles: Particles, clock: Clock) -> Tensor:

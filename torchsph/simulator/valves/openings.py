@@ -133,6 +133,10 @@ class Openings:
                 fastest = max(fastest, max(grown, gone) / span)
         return 1.0 / fastest if fastest > 0.0 else None
 
+    def place_number(self, times: Tensor) -> Tensor:
+        """Which of its places one after another every opening is in at times (s): the same number, the same planes."""
+        return torch.zeros_like(times) if self._pace is None else torch.round(times / self._pace)
+
     def plane(self, number: int, time: float) -> OpeningPlane:
         """Opening ``number`` at ``time`` (s), to within the little that it may change unseen."""
         if self._pace is not None:
@@ -154,10 +158,12 @@ class Openings:
         return self._planes[label]
 
     def active(self, clock: Clock) -> list[tuple[int, OpeningPlane]]:
-        """(number, plane now) of the openings of open valves."""
-        return [
-            (n, self.plane(n, clock.mean)) for n, orifice in enumerate(self.all) if orifice.label in clock.open_regions
-        ]
+        """(number, plane now) of the openings of open valves, for members that see the same planes."""
+        return self.active_at(clock.first, clock)
+
+    def active_at(self, time: float, clock: Clock) -> list[tuple[int, OpeningPlane]]:
+        """(number, plane at ``time``, s) of the openings of valves that are open in the clock's interval."""
+        return [(n, self.plane(n, time)) for n, orifice in enumerate(self.all) if orifice.label in clock.open_regions]
 
     def shut(self, clock: Clock) -> list[int]:
         """Numbers of the openings of valves that are shut."""

@@ -17,6 +17,7 @@ from torchsph.pairs.moving_least_squares import fetch_at
 from ..state.clock import Clock
 from ..state.particles import RESERVOIR, Particles
 from .openings import OpeningPlane, Openings
+from .plane_groups import apart
 
 # depth (spacings) inside an opening at which the pressure is read, and the velocity of fluid that enters (new particles
 # are noisy); that of fluid that leaves is read in the opening itself, where it may still gather speed. Support of the
@@ -62,8 +63,17 @@ class PressureReservoirs:
         self._support_radius, self._unit, self._period = support_radius, pressure_unit, period
         self.kinds = torch.tensor([RESERVOIR + n for n in openings.given], device=device)
 
-    def driven(self, particles: Particles, clock: Clock, scheme: PressureScheme) -> Particles:
-        """Give the buffers the pressure of the present time, and the velocity of the fluid before them."""
+    def driven(self, particles: Particles, clock: Clock, scheme: PressureScheme, stepping: Tensor) -> Particles:
+        """Give the buffers of the members ``stepping`` (members,) bool the pressure of the present time.
+
+        And the velocity of the fluid before them.
+        """
+        return apart(
+            self._openings, particles, clock, lambda some, at: (self._driven(some, at, scheme), False), stepping
+        )[0]
+
+    def _driven(self, particles: Particles, clock: Clock, scheme: PressureScheme) -> Particles:
+        """The same for members that see the same planes."""
         active = [(n, plane) for n, plane in self._openings.active(clock) if n in self._openings.given]
         given = self._given([n for n, _ in active], particles.members, clock)
         for (number, plane), level in zip(active, given, strict=True):

@@ -26,6 +26,7 @@ from .cavity_volume import CavityVolume
 from .flux_split import fluxes, takers
 from .model import Pressure, ValveModel, ValveSetting
 from .openings import OpeningPlane, Openings
+from .plane_groups import apart, groups
 from .pressure_reservoirs import PressureReservoirs
 from .shared_flux import MOUTH, SharedFlux
 from .volume_match import levelled, volume_inside
@@ -72,7 +73,7 @@ class Reservoirs(ValveModel):
         return PressureReservoirs(self.openings, backend, s.support_radius, unit, s.period, s.device)
 
     def _deficit(self, particles: Particles, clock: Clock) -> Tensor:
-        """Volume that the particles inside fall short of the cavity's, (members,), internal."""
+        """Volume that the particles inside fall short of the cavity's, (members,), internal; of the same planes."""
         filled = volume_inside(particles, [plane for _, plane in self.openings.active(clock)])
         wanted = self.volume.volume(clock.of_members(particles.members), torch.float64)
         return (wanted - filled).to(self._setting.dtype)
@@ -82,7 +83,14 @@ class Reservoirs(ValveModel):
         times = clock.of_members(particles.members)
         if self.relaxation is None:
             return torch.zeros_like(times, dtype=self._setting.dtype)
-        return self._deficit(particles, clock) / (self.volume.volume(times) * self.relaxation)
+        deficit = torch.zeros_like(times, dtype=self._setting.dtype)
+        for group in groups(self.openings, clock, particles.members):
+            if group is None:
+                deficit = self._deficit(particles, clock)
+            else:
+                mine = self._deficit(particles.select(group[particles.member]), clock.seen_by(group))
+                deficit = torch.where(group, mine, deficit)
+        return deficit / (self.volume.volume(times) * self.relaxation)
 
     def _lead(self, number: int, clock: Clock, members: int) -> float | Tensor:
         """Length of the free channel before the buffer of an opening: 0 where fluid enters in the present interval.
@@ -150,6 +158,12 @@ class Reservoirs(ValveModel):
         """Give the buffers' particles their velocity for the present time; with ``channel`` also the free channels'."""
         if not clock.open_regions:
             return particles
+        return apart(
+            self.openings, particles, clock, lambda some, at: (self._driven(some, at, channel=channel), False)
+        )[0]
+
+    def _driven(self, particles: Particles, clock: Clock, *, channel: bool) -> Particles:
+        """The same for members that see the same planes."""
         times = clock.of_members(particles.members)
         inflow, active, given = self.volume.rate(times), self.openings.active(clock), self.openings.given
         if self.relaxation is not None and not channel and not any(number in given for number, _ in active):
@@ -181,9 +195,21 @@ class Reservoirs(ValveModel):
         return particles.changed(velocity=velocity)
 
     def exchange(
-        self, particles: Particles, clock: Clock, record: Record, pressure: Pressure
+        self, particles: Particles, clock: Clock, record: Record, pressure: Pressure, stepping: Tensor
     ) -> tuple[Particles, bool]:
         """Turn particles that have crossed an open orifice into the other kind; feed and clear the far ends."""
+        if not clock.open_regions:
+            return particles, False
+
+        def work(some: Particles, at: Clock) -> tuple[Particles, bool]:
+            return self._exchanged(some, at, record, pressure)
+
+        return apart(self.openings, particles, clock, work, stepping)
+
+    def _exchanged(
+        self, particles: Particles, clock: Clock, record: Record, pressure: Pressure
+    ) -> tuple[Particles, bool]:
+        """The same for members that see the same planes."""
         kind, gone = particles.kind, torch.zeros_like(particles.fluid)
         fresh: list[Particles] = []
         for number, plane in self.openings.active(clock):
@@ -260,7 +286,7 @@ class Reservoirs(ValveModel):
     def beyond(self, position: Tensor, clock: Clock) -> Tensor:
         """(n,) bool: points (n, D) at an open valve or behind it."""
         beyond = super().beyond(position, clock)
-        for _, plane in self.openings.active(clock):
+        for _, plane in self.openings.active_at(clock.middle, clock):
             beyond |= plane.behind(position)
         return beyond
 

@@ -9,22 +9,24 @@ import torch
 from torch import Tensor
 
 from geometry import Grid, OrificePlane, Surface, WallMotion, grid_winding, orifices
+from geometry.motion.key_times import KeyTimes
 from torchsph.pairs.smoothing_kernels import SmoothingKernel
 
 from .closest import closest_on_grid
 from .completeness import KernelCompleteness
 from .interface import CompleteWallSample, WallSample
-from .key_times import KeyTimes
 from .look_up import LookUp, by_node
 
 # look-up spacing in particle spacings: half of it resolves the kernel's completeness to a percent (test_walls)
 _FIELD_SPACING = 0.5
 # distances outside the wall are exact this far (spacings): particles are put back long before
-_STRAY = 2.0
+STRAY = 2.0
 # this far beyond the kernel's reach (spacings) the kernel is complete and nothing else of the wall is asked for
 _FAR = 1.0
 # fields kept: the beat is run through in order, and a forecast of 40 ms spans about ten of them
 _KEPT = 12
+# cavities kept (a byte a node): a start is seeded with every valve shut, and its first step finds the same times
+_CAVITIES = 4
 # of small grids more are kept, so that a second beat finds those of the first (bytes)
 _MEMORY = 1 << 27
 
@@ -76,6 +78,7 @@ class WallFields:
             self._completeness = KernelCompleteness(self.grid.shape, _FIELD_SPACING, kernel, smoothing_length, dtype)
         self._openings = orifices(motion)
         self._made: OrderedDict[tuple[int, tuple[int, ...]], Tensor] = OrderedDict()
+        self._cavity: OrderedDict[float, np.ndarray] = OrderedDict()
 
     def _grid(self) -> Grid:
         every = np.concatenate([self.motion.vertices(t) for t in self.key_times.times])
@@ -121,10 +124,10 @@ class WallFields:
 
         Exact inside as far as kernels see and outside as far as particles may stray; farther away a bound does.
         """
-        inside = (grid_winding(self.grid, surface.vertices, surface.faces) > 0).reshape(-1)
+        inside = self._inside(surface, time)
         shut = ~np.isin(surface.region, open_regions)
         solid = Surface(surface.vertices, surface.faces[shut], surface.region[shut])
-        limit = np.where(inside, self.reach + 0.5 + _FIELD_SPACING, _STRAY) * self.spacing
+        limit = np.where(inside, self.reach + 0.5 + _FIELD_SPACING, STRAY) * self.spacing
         distance, carried = closest_on_grid(self.grid, solid, self.motion.velocity(time), limit)
         np.negative(distance, out=distance, where=~inside)
         depth = (self.reach + 2.0) * self.spacing
@@ -134,6 +137,14 @@ class WallFields:
                 # the channel goes with its orifice as a whole: a rim that closes in must not squeeze what is beyond it
                 carried[channel] = opening.velocity(time)
         return distance, carried
+
+    def _inside(self, surface: Surface, time: float) -> np.ndarray:
+        """(n,) bool: nodes inside the walls; remembered for the next set of open valves at the same time."""
+        if time not in self._cavity:
+            while len(self._cavity) >= _CAVITIES:
+                self._cavity.popitem(last=False)
+            self._cavity[time] = (grid_winding(self.grid, surface.vertices, surface.faces) > 0).reshape(-1)
+        return self._cavity[time]
 
     def between(self, first: Tensor, second: Tensor) -> LookUp:
         """The fields of two key times made ready for look-ups between them."""

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from ..acquisition import Packet
+from ..phase import baseband
 from .box_sums import box_sum
 from .clutter import ClutterFilter, FIRFilter
 
@@ -69,8 +70,10 @@ def colour_doppler(packet: Packet, points: Tensor, options: ColourDoppler) -> Do
         options: window, filter and gate.
 
     Raises:
-        ValueError: where the clutter filter leaves fewer than two images or points lie outside.
+        ValueError: where the clutter filter leaves fewer than two images, points lie outside, or the packet's phase
+            fits no convention.
     """
+    packet = baseband(packet)
     finite = torch.isfinite(torch.view_as_real(packet.iq)).all(-1).all(0)
     clean = torch.where(finite, packet.iq, 0)
     filtered = clean if options.clutter is None else options.clutter.apply(clean)

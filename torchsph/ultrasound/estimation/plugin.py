@@ -29,6 +29,7 @@ import torch
 from torch import Tensor
 
 from ..acquisition import Packet
+from ..phase import baseband
 from .clutter import ClutterFilter
 from .estimates import Estimates, Flag
 
@@ -103,6 +104,7 @@ class LibraryTracker:
         """
         if packet.beams.apex is not None:
             raise ValueError("the library's interface knows parallel beams only")
+        packet = baseband(packet)
         iq = packet.iq if self.clutter is None else self.clutter.apply(packet.iq)
         samples = torch.view_as_real(iq.to(torch.complex64).cpu().contiguous()).contiguous()
         dimension = packet.grid.dimension

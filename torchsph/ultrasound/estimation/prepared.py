@@ -11,6 +11,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ..acquisition import Packet
+from ..phase import baseband
 from .backends import TrackingBackend
 from .clutter import ClutterFilter
 from .correlation import KernelShape, Triple, triple
@@ -174,10 +175,11 @@ def prepare(
         backend: who does the sums.
 
     Raises:
-        ValueError: where the filter leaves fewer than ``least_images``.
+        ValueError: where the filter leaves fewer than ``least_images``, or the packet's phase fits no convention.
     """
     if len(packet.iq) < 2:
         raise ValueError(f"speckle tracking compares images; the packet has {len(packet.iq)}")
+    packet = baseband(packet)
     spacing = list(reversed(packet.grid.spacing))
     half = [max(round(kernel / (2 * s)), (min_samples - 1) // 2) for s in spacing]
     search = [math.ceil(reach / s + 0.5 - 1e-9) for s in spacing]

@@ -9,7 +9,7 @@ import torch
 
 from geometry import Grid
 
-from ..acquisition import Acquisition, Beams, Packet
+from ..acquisition import Acquisition, Beams, IQPhase, Packet
 from .flow import Flow
 from .image import Imager, ParallelImager
 from .pointspread import GaussianPointSpread, PointSpread, SectorPointSpread
@@ -106,7 +106,7 @@ def simulate_packet(
         if number + 1 < acquisition.packet:
             cloud = carry(cloud, box, flow, image_time, acquisition.interval, density, generator)
             cloud = reseed(cloud, box, flow, image_time + acquisition.interval, density, generator)
-    return Packet(images, grid, acquisition, model.beams, noise)
+    return Packet(images, grid, acquisition, model.beams, noise, IQPhase.BASEBAND)
 
 
 def make_imager(

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 
@@ -51,18 +52,35 @@ def test_an_error_of_zero_where_something_was_measured(measured: Recording) -> N
     weight[1, 2, 3, 2] = 0.0
     refuse_exact(replace(told, weight=weight))
     refuse_exact(measured)
+    for look in (ts.smooth, ts.PreparedMeasurement):
+        with pytest.raises(RecordingError, match="the measurement: /sigma: must be positive and finite"):
+            look(told)
 
 
 @pytest.mark.parametrize("command", ["smooth", "assimilate"])
+@pytest.mark.parametrize(("dataset", "words"), [("weight", "is 0 at every node"), ("sigma", "is 0 for 1 of")])
 def test_commands_name_the_file(
-    command: str, measured: Recording, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    command: str, dataset: str, words: str, measured: Recording, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "silent.h5"
-    write_recording(path, replace(measured, weight=np.zeros_like(measured.weight)))
+    values = {"weight": np.zeros_like(measured.weight), "sigma": np.full_like(measured.velocity, 0.1)}
+    write_recording(path, replace(measured, **{dataset: values[dataset]}))
+    if dataset == "sigma":
+        with h5py.File(path, "r+") as file:
+            file["sigma"][0, 0, 2, 2, 2] = 0.0
     assert main([command, str(path), "--out", str(tmp_path / "out")]) == 2
     said = capsys.readouterr().err
-    assert f"torchsph {command}: error: {path}: /weight: is 0 at every node" in said and said.count("\n") == 1
+    assert f"torchsph {command}: error: {path}: /{dataset}: {words}" in said and said.count("\n") == 1
     assert not (tmp_path / "out").exists()
+
+
+def test_a_frame_without_data_is_forecast(measured: Recording) -> None:
+    weight = measured.weight.copy()
+    weight[1] = 0.0
+    model = ts.make_model(measured, spacing=3e-3)
+    found = ts.filter_sph(replace(measured, weight=weight), model, seed=1).recording.velocity
+    first = ts.filter_sph(measured.select(slice(0, 2)), model, seed=1).recording.velocity
+    assert np.isfinite(found).all() and np.array_equal(found[0], first[0]) and not np.array_equal(found[1], first[1])
 
 
 def test_recordings_of_another_dimension_than_the_simulator_s(

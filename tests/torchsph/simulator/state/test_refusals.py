@@ -66,6 +66,15 @@ REFUSED: dict[str, tuple[Callable[[], object], str]] = {
     ),
     "confidence below 0": (lambda: RUN.impose(GRID, FLOW, MASK, at(-0.1, WEIGHT, 3, 3)), r"is -0.1 at \(3, 3\)"),
     "short confidence": (lambda: RUN.impose(GRID, FLOW, MASK, WEIGHT[0]), "confidence must have the shape"),
+    "confidence in nothing": (
+        lambda: RUN.impose(GRID, FLOW, MASK, 0 * WEIGHT),
+        "confidence is 0 at every node of the m",
+    ),
+    "confidence beside the mask": (
+        lambda: RUN.impose(GRID, FLOW, MASK & (WEIGHT.cumsum(0) < 2), (WEIGHT.cumsum(0) > 2) * WEIGHT),
+        "confidence is 0 at every node of the mask, .* or None for all alike",
+    ),
+    "pull by nothing": (lambda: RUN.pull(GRID, FLOW, WEIGHT, 0 * WEIGHT), "weight is 0 at every node, .*do not pull"),
     "pull in space": (lambda: RUN.pull(SPACE, FLOW, WEIGHT, WEIGHT), "grid of 3 dimensions"),
     "pull to NaN": (lambda: RUN.pull(GRID, at(NAN, FLOW, 0, 2, 3), WEIGHT, WEIGHT), "target is not finite"),
     "pull by NaN": (

@@ -5,12 +5,12 @@ import pytest
 import torch
 
 import geometry
+from geometry.motion.key_times import KeyTimes
 from geometry.surfaces.closest import SurfaceIndex
 from torchsph import Scene, Simulator, preset
 from torchsph.pairs.smoothing_kernels import kernel
 from torchsph.simulator.scene import Valve
 from torchsph.simulator.walls.fields import WallFields
-from torchsph.simulator.walls.key_times import KeyTimes
 
 SPACING = 1e-3
 

@@ -1,4 +1,8 @@
-"""The times at which fields of a moving wall are made: more of them than key frames, or fewer, by how it moves."""
+"""The times at which fields of a moving wall are made: more of them than key frames, or fewer, by how it moves.
+
+Fields of the wall (distance, normal, velocity) on a grid stand at these times and are linear in time between them, as
+the two textures of Grønli 2017, sec. 3.1.3.
+"""
 
 from __future__ import annotations
 
@@ -7,11 +11,9 @@ import math
 
 import numpy as np
 
-from geometry import WallMotion
+from .wall_motion import WallMotion
 
-# between two key times no vertex goes farther than this (spacings); the indicator of the fluid would smear else
-_LONGEST_PATH = 1.0
-# between two key times the wall's path may leave the straight line by this much (spacings) ...
+# between two key times the wall's path may leave the straight line by this part of the longest path ...
 _LARGEST_BEND = 0.02
 # ... where key times are put between key frames; key frames are left out only where it is far less than that, and the
 # velocity as near to linear, as a part of the fastest wall's
@@ -24,19 +26,21 @@ class KeyTimes:
 
     Args:
         motion: the wall.
-        spacing: of the particles, m.
+        spacing: of the particles or of the fields' grid, m.
+        longest_path: between two key times no vertex goes farther than this (spacings); an indicator of the fluid
+            would smear else. inf: key frames alone count.
 
     Attributes:
         times: s, increasing.
     """
 
-    def __init__(self, motion: WallMotion, spacing: float) -> None:
-        self.motion = motion
+    def __init__(self, motion: WallMotion, spacing: float, *, longest_path: float = 1.0) -> None:
+        self.motion, self.longest_path = motion, longest_path
         self.times: list[float] = [float(t) for t in motion.time]
         if motion.moves:
-            keys = _spared(motion, spacing)
+            keys = _spared(motion, spacing, longest_path)
             spans = zip(keys, keys[1:], strict=False)
-            added = [t for early, late in spans for t in _between(motion, early, late, spacing)]
+            added = [t for early, late in spans for t in _between(motion, early, late, spacing, longest_path)]
             self.times = sorted([float(motion.time[k]) for k in keys] + added)
 
     def bracket(self, time: float) -> tuple[int, int, float, float]:
@@ -76,23 +80,23 @@ class KeyTimes:
         return beats * period
 
 
-def _spared(motion: WallMotion, spacing: float) -> list[int]:
+def _spared(motion: WallMotion, spacing: float, longest: float) -> list[int]:
     """Key frames that are needed: those between which the others lie on a straight path, passed at linear velocity."""
     fastest = float(np.linalg.norm(motion.rates_at_keys, axis=2).max())
     kept, last = [0], len(motion.time) - 1
     while kept[-1] < last:
         start = stop = kept[-1]
         stop += 1
-        while stop < last and _straight(motion, start, stop + 1, spacing, fastest):
+        while stop < last and _straight(motion, start, stop + 1, spacing, longest, fastest):
             stop += 1
         kept.append(stop)
     return kept
 
 
-def _straight(motion: WallMotion, start: int, stop: int, spacing: float, fastest: float) -> bool:
+def _straight(motion: WallMotion, start: int, stop: int, spacing: float, longest: float, fastest: float) -> bool:
     """Whether the key frames between two may be left out."""
     x, v, t = motion.vertices_at_keys, motion.rates_at_keys, motion.time
-    if np.linalg.norm(x[stop] - x[start], axis=1).max() > _LONGEST_PATH * spacing:
+    if np.linalg.norm(x[stop] - x[start], axis=1).max() > longest * spacing:
         return False
     part = ((t[start + 1 : stop] - t[start]) / (t[stop] - t[start]))[:, None, None]
     bend = np.abs(x[start + 1 : stop] - x[start] - part * (x[stop] - x[start])).max()
@@ -100,9 +104,9 @@ def _straight(motion: WallMotion, start: int, stop: int, spacing: float, fastest
     return bend <= _SPARED_BEND * spacing and unlike <= _SPARED_VELOCITY * fastest
 
 
-def _between(motion: WallMotion, start: int, stop: int, spacing: float) -> list[float]:
+def _between(motion: WallMotion, start: int, stop: int, spacing: float, longest: float) -> list[float]:
     """Key times to put between two key frames that follow each other."""
-    if stop > start + 1:
+    if stop > start + 1 or not math.isfinite(longest):
         return []
     early, late = float(motion.time[start]), float(motion.time[stop])
     parts = np.arange(_SAMPLES + 1) / _SAMPLES
@@ -111,5 +115,5 @@ def _between(motion: WallMotion, start: int, stop: int, spacing: float) -> list[
     straight = places[0] + parts[:, None, None] * (places[-1] - places[0])
     bend = np.linalg.norm(places - straight, axis=2).max()
     # cut in n, a curve leaves its chords by 1 / n^2 of what it leaves the whole one
-    count = math.ceil(max(path / (_LONGEST_PATH * spacing), math.sqrt(bend / (_LARGEST_BEND * spacing))) - 1e-9)
+    count = math.ceil(max(path / (longest * spacing), math.sqrt(bend / (_LARGEST_BEND * longest * spacing))) - 1e-9)
     return [early + k / count * (late - early) for k in range(1, count)]

@@ -1,0 +1,185 @@
+"""Quantities of a flow as a JSON document, a CSV and a table: of an analysis, of its members, of a truth."""
+
+from __future__ import annotations
+
+import argparse
+import csv
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+import geometry
+from torchsph.evaluation.frames import matching_frames
+from torchsph.evaluation.metrics import filled_velocity
+from torchsph.haemodynamics.beat import BEAT_UNITS, beat_numbers
+from torchsph.haemodynamics.quantities import UNITS, FlowDomain, flow_quantities
+from torchsph.haemodynamics.uncertainty import Summary, coverage
+from torchsph.methods.members.quantities import MemberCurves
+
+from .outputs import write_json
+
+__all__ = ["CAUTION", "QuantityTables", "methods_read_out", "plain_curves"]
+
+Curves = dict[str, NDArray[np.float64]]
+
+CAUTION = (
+    "At 1 mm and 10 ms do not believe as they stand: wall shear stress, energy loss and vorticity (too small in smooth "
+    "fields, too large in raw ones), helicity; a mean field's kinetic energy is too small unless /sigma is there. "
+    "For research, not for clinical use."
+)
+
+
+def plain_curves(recording: geometry.Recording) -> Curves:
+    """The curves of one recording alone; the variance that an analysis claims is added to its kinetic energy."""
+    sigma = recording.sigma if recording.weight is None else None  # of a measurement it is noise, not missing energy
+    return flow_quantities(FlowDomain.from_recording(recording), filled_velocity(recording), sigma=sigma)
+
+
+@dataclass(frozen=True)
+class QuantityTables:
+    """Curves and numbers of a beat, and their bands where there are members.
+
+    Attributes:
+        time: (T,), s.
+        curves: by their source ("analysis", "truth"), then by the names of ``UNITS``, (T,).
+        bands: of the members, by the names of ``UNITS``; none without members.
+        beat_bands: of the numbers of the beat.
+    """
+
+    time: NDArray[np.float64]
+    curves: dict[str, Curves]
+    bands: dict[str, Summary] = field(default_factory=dict)
+    beat_bands: dict[str, Summary] = field(default_factory=dict)
+
+    @classmethod
+    def of(
+        cls,
+        recording: geometry.Recording,
+        members: MemberCurves | None = None,
+        truth: geometry.Recording | None = None,
+    ) -> QuantityTables:
+        """Of an analysis, of its members where they have been read out, and of the truth's frames at its times."""
+        if members is None:
+            made = cls(recording.time, {"analysis": plain_curves(recording)})
+        else:
+            # what is quadratic in the velocity is too small in the analysis itself: its best value is the members' mean
+            made = cls(recording.time, {"analysis": members.estimate}, members.bands(), members.beat_bands())
+        if truth is not None:
+            made.curves["truth"] = plain_curves(truth.select(matching_frames(recording.time, truth.time, "the truth")))
+        return made
+
+    @property
+    def beat(self) -> dict[str, Curves]:
+        """Numbers of the beat by their source."""
+        return {name: beat_numbers(self.time, curves) for name, curves in self.curves.items()}
+
+    def document(self, config: Mapping[str, Any]) -> dict[str, Any]:
+        """The content of `quantities.json`."""
+        members: dict[str, Any] = {}
+        if self.bands:
+            members["members"] = {
+                "curves": {name: band._asdict() for name, band in self.bands.items()},
+                "beat": {name: band._asdict() for name, band in self.beat_bands.items()},
+            }
+            if "truth" in self.curves:
+                members["members"]["coverage"] = self.coverage()
+        return {
+            "time": self.time,
+            "units": UNITS | BEAT_UNITS,
+            "curves": self.curves,
+            "beat": self.beat,
+            **members,
+            "caution": CAUTION,
+            "config": dict(config),
+        }
+
+    def coverage(self) -> dict[str, float]:
+        """Share of the truth's frames inside the members' band, by quantity."""
+        return {name: coverage(band, self.curves["truth"][name]) for name, band in self.bands.items()}
+
+    def write(self, folder: Path, config: Mapping[str, Any]) -> None:
+        """`quantities.json` and `quantities.csv`."""
+        write_json(folder / "quantities.json", self.document(config))
+        columns = [(f"{source} {name}", name, self.curves[source][name]) for source in self.curves for name in UNITS]
+        for name, band in self.bands.items():
+            columns += [(f"members {name} {part}", name, values) for part, values in band._asdict().items()]
+        with (folder / "quantities.csv").open("w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file)
+            writer.writerow(["time [s]", *(f"{label} [{UNITS[name]}]" for label, name, _ in columns)])
+            for frame, t in enumerate(self.time):
+                writer.writerow([f"{t:.9g}", *(f"{values[frame]:.9g}" for _, _, values in columns)])
+
+    def table(self) -> list[list[str]]:
+        """RMS over time of every curve, then the numbers of the beat; with bands and errors where they are known."""
+        compared, banded = "truth" in self.curves, bool(self.bands)
+        heads = ["quantity", "unit", "analysis", *(["members", "+-"] if banded else [])]
+        rows = [heads + (["truth", "error"] if compared else []) + (["in band"] if compared and banded else [])]
+        inside = self.coverage() if compared and banded else {}
+        for name, unit in UNITS.items():
+            row = [f"{name} (RMS)", unit, f"{_rms(self.curves['analysis'][name]):.4g}"]
+            best = self.curves["analysis"][name]
+            if banded:
+                best = self.bands[name].mean
+                row += [f"{_rms(best):.4g}", f"{_rms(self.bands[name].deviation):.2g}"]
+            if compared:
+                true = self.curves["truth"][name]
+                row += [f"{_rms(true):.4g}", f"{_rms(best - true) / _rms(true):.3f}" if _rms(true) > 0 else "-"]
+            rows.append(row + ([f"{inside[name]:.2f}"] if inside else []))
+        return rows + self._beat_rows(compared, banded)
+
+    def _beat_rows(self, compared: bool, banded: bool) -> list[list[str]]:
+        rows, beat = [], self.beat
+        for name, unit in BEAT_UNITS.items():
+            best = float(beat["analysis"][name])
+            row = [name, unit, _number(best)]
+            if banded:
+                band = self.beat_bands[name]
+                best = float(band.mean)
+                row += [_number(best), _number(float(band.deviation), 2)]
+            if compared:
+                true = float(beat["truth"][name])
+                row += [_number(true), f"{best - true:+.3g}" if np.isfinite(best - true) else "-"]
+                if banded:
+                    row.append("yes" if band.low <= true <= band.high else "no" if np.isfinite(true) else "-")
+            rows.append(row)
+        return rows
+
+    def lines(self) -> list[str]:
+        """The table as lines of text, with the caution below."""
+        rows = self.table()
+        text = [
+            "  ".join(cell.ljust(34) if n == 0 else cell.rjust(10) for n, cell in enumerate(row)).rstrip()
+            for row in rows
+        ]
+        return [*text, CAUTION]
+
+
+def methods_read_out(args: argparse.Namespace, methods: Sequence[str], measured: geometry.Recording) -> tuple[str, ...]:
+    """The methods whose members are read out, as the options of a run ask for it.
+
+    Raises:
+        ValueError: options that cannot be together, or a plane recording whose quantities are asked for outright.
+    """
+    if args.keep_members and ("ensemble" not in methods or args.lag is not None):
+        raise ValueError("--keep-members: only the ensemble has members, and with --lag they change after their time")
+    if args.quantities and args.no_quantities:
+        raise ValueError("--quantities and --no-quantities cannot be together")
+    if args.quantities and (measured.dimension != 3 or measured.wall is None):
+        raise ValueError("--quantities: those of a whole flow need a recording in space with walls (/wall)")
+    if args.no_quantities or measured.dimension != 3 or measured.wall is None:
+        return ()
+    if "ensemble" in methods:
+        return ("ensemble",) if args.lag is None else ()
+    return ("spline",) if args.quantities and methods[0] == "spline" else ()
+
+
+def _rms(values: NDArray[np.float64]) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def _number(value: float, digits: int = 4) -> str:
+    return f"{value:.{digits}g}" if np.isfinite(value) else "-"

@@ -1,0 +1,144 @@
+"""What is read out of every member of every frame, computed as the frames come."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+import geometry
+from torchsph.haemodynamics.beat import beat_numbers
+from torchsph.haemodynamics.pressure import region_mean
+from torchsph.haemodynamics.quantities import PROBE, UNITS, FlowDomain, FrameQuantities
+from torchsph.haemodynamics.uncertainty import Summary, summary
+
+from .frames import MemberFrame
+
+__all__ = ["MemberCurves", "MemberQuantities", "quantified", "with_pressure"]
+
+Array = NDArray[np.float64]
+
+_NODES_AT_ONCE = 1e6
+"""Members are taken in groups of about so many numbers: some 300 MB with all that is derived from them."""
+
+
+@dataclass(frozen=True)
+class MemberCurves:
+    """Quantities of an analysis and its members over time.
+
+    Attributes:
+        time: `(T,)`, s.
+        estimate: of the analysis, by the names of `quantities.UNITS`, `(T,)`.
+        members: of every member, `(N, T)`.
+        pressure: `(T, *shape)`, Pa, the simulator's own where there is one, else that of the velocities; its mean at
+            the inlet is 0.
+        pressure_sigma: `(T, *shape)`, Pa, standard deviation over the members.
+    """
+
+    time: Array
+    estimate: dict[str, Array]
+    members: dict[str, Array]
+    pressure: NDArray[np.float32]
+    pressure_sigma: NDArray[np.float32]
+
+    def bands(self) -> dict[str, Summary]:
+        """Mean, deviation and band of every curve."""
+        return {name: summary(values) for name, values in self.members.items()}
+
+    def beat(self) -> dict[str, Array]:
+        """Numbers of the beat of the analysis."""
+        return beat_numbers(self.time, self.estimate)
+
+    def beat_bands(self) -> dict[str, Summary]:
+        """Mean, deviation and band of the numbers of the beat."""
+        return {name: summary(values) for name, values in beat_numbers(self.time, self.members).items()}
+
+
+class MemberQuantities:
+    """Takes frames one at a time and keeps their numbers, and the pressure's field and deviation.
+
+    Args:
+        recording: whose masks, walls, valves and fluid they are.
+
+    Raises:
+        ValueError: it is a plane recording.
+    """
+
+    def __init__(self, recording: geometry.Recording) -> None:
+        self.domain = FlowDomain.from_recording(recording)
+        self._sampler = geometry.WallSampler(self.domain.motion, min(self.domain.grid.spacing))
+        self._curves: list[Array] = []
+        self._pressure: list[NDArray[np.float32]] = []
+        self._sigma: list[NDArray[np.float32]] = []
+
+    def take(self, frame: MemberFrame) -> None:
+        """Compute the quantities of one frame; a frame that comes again takes the place of its first."""
+        for kept in (self._curves, self._pressure, self._sigma):
+            del kept[frame.frame :]
+        if len(self._curves) != frame.frame:
+            raise ValueError(f"frame {frame.frame} comes after {len(self._curves)} frames: they must come in order")
+        of_frame = FrameQuantities(self.domain, frame.frame, self._sampler)
+        velocity = np.concatenate([frame.field[None], frame.members])
+        rate = np.concatenate([frame.rate[None], frame.member_rates])
+        group = max(1, int(_NODES_AT_ONCE / self.domain.grid.size))
+        parts = [
+            of_frame.of(np.nan_to_num(velocity[k : k + group], posinf=0.0, neginf=0.0), rate[k : k + group])
+            for k in range(0, len(velocity), group)
+        ]
+        self._curves.append(np.concatenate([np.stack([p.curves[name] for name in UNITS], axis=-1) for p in parts]))
+        pressures = np.concatenate([p.pressure.astype(np.float32) for p in parts])
+        pressures = np.stack([self._gauged(one, of_frame) for one in pressures])
+        own = pressures[0]
+        if frame.pressure is not None:
+            simulated = self._gauged(np.where(np.isfinite(frame.pressure), frame.pressure, own), of_frame)
+            own = np.where(np.isfinite(frame.pressure), simulated, own)
+        self._pressure.append(own.astype(np.float32))
+        self._sigma.append(pressures[1:].std(0, ddof=1).astype(np.float32))
+
+    def found(self) -> MemberCurves:
+        """All that has been found of all frames."""
+        if len(self._curves) != len(self.domain.time):
+            raise ValueError(f"{len(self._curves)} of {len(self.domain.time)} frames have come: the run did not end")
+        curves = np.stack(self._curves)  # (T, 1 + N, quantities)
+        estimate = {name: curves[:, 0, k] for k, name in enumerate(UNITS)}
+        members = {name: curves[:, 1:, k].T for k, name in enumerate(UNITS)}
+        return MemberCurves(self.domain.time, estimate, members, np.stack(self._pressure), np.stack(self._sigma))
+
+    def state(self) -> dict[str, Any]:
+        """What a checkpoint has to hold."""
+        kept = {"curves": self._curves, "pressure": self._pressure, "sigma": self._sigma}
+        return {
+            name: [torch.from_numpy(np.ascontiguousarray(each)) for each in values] for name, values in kept.items()
+        }
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on from what ``state`` gave."""
+        self._curves, self._pressure, self._sigma = (
+            [np.asarray(each) for each in state[name]] for name in ("curves", "pressure", "sigma")
+        )
+
+    def _gauged(self, pressure: NDArray[np.floating], of_frame: FrameQuantities) -> NDArray[np.float32]:
+        """A pressure `(*shape)`, Pa, less its mean around the inlet; 0 outside the mask."""
+        probe = PROBE * min(self.domain.grid.spacing)
+        upper = of_frame.base - probe * of_frame.axis
+        at_base = region_mean(pressure, of_frame.mask, self.domain.grid, upper, probe)
+        return np.where(of_frame.mask, pressure - at_base, 0.0).astype(np.float32)
+
+
+def with_pressure(recording: geometry.Recording, curves: MemberCurves | None) -> geometry.Recording:
+    """A recording with the pressure and its deviation that have been read out of it; without any, as it is."""
+    if curves is None:
+        return recording
+    return replace(recording, pressure=curves.pressure, pressure_sigma=curves.pressure_sigma)
+
+
+def quantified(recording: geometry.Recording, frames: Iterable[MemberFrame]) -> MemberCurves:
+    """The curves of an analysis from all of its frames, taken one at a time."""
+    quantities = MemberQuantities(recording)
+    for frame in frames:
+        quantities.take(frame)
+    return quantities.found()

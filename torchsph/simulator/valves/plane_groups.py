@@ -1,0 +1,70 @@
+"""Members whose openings stand in the same place are worked on together, the others apart.
+
+An opening stays in one place for a while and then goes on to the next (``Openings.plane``). Members step each at its
+own pace, so that for a moment some see the earlier place and some the later one: each the one of its own time, as it
+would alone. Members that do not step are left as they are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from ..state.clock import Clock
+from ..state.particles import Particles
+from .openings import Openings
+
+# what is done to the particles of some members at their present times; True where they were renumbered
+Work = Callable[[Particles, Clock], tuple[Particles, bool]]
+
+
+def groups(openings: Openings, clock: Clock, members: int, stepping: Tensor | None = None) -> list[Tensor | None]:
+    """Members (members,) bool that see the same planes, those with the earliest first; None stands for all.
+
+    Args:
+        openings: of the scene's valves.
+        clock: the present times.
+        members: their number.
+        stepping: (members,) bool, those that count; None: all.
+    """
+    counted = stepping is None or bool(stepping.all())
+    place = openings.place_number(clock.times)
+    if place.ndim == 0 or members == 1 or bool((place == place[0]).all()):
+        return [None] if counted else [stepping]
+    found = torch.unique(place if counted else place[stepping])
+    return [(place == number) if counted else (place == number) & stepping for number in found]
+
+
+def apart(
+    openings: Openings, particles: Particles, clock: Clock, work: Work, stepping: Tensor | None = None
+) -> tuple[Particles, bool]:
+    """Particles of all members after work on those of each group; True where they were renumbered.
+
+    Args:
+        openings: of the scene's valves.
+        particles: of all members.
+        clock: their present times.
+        work: what is done.
+        stepping: (members,) bool, those to whom it is done; None: all.
+    """
+    found = groups(openings, clock, particles.members, stepping)
+    if found == [None]:
+        return work(particles, clock)
+    rows, parts, renumbered = [], [], False
+    left = torch.ones(particles.count, dtype=torch.bool, device=particles.member.device)
+    for group in found:
+        mine = group[particles.member]
+        part, changed = work(particles.select(mine), clock.seen_by(group))
+        rows.append(torch.nonzero(mine).squeeze(1))
+        parts.append(part)
+        renumbered |= changed
+        left &= ~mine
+    rows.append(torch.nonzero(left).squeeze(1))
+    parts.append(particles.select(left))
+    together = parts[0]
+    for part in parts[1:]:
+        together = together.joined(part)
+    # where none came or went every particle goes back to its own row
+    return (together if renumbered else together.select(torch.argsort(torch.cat(rows)))), renumbered
