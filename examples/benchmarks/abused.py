@@ -70,7 +70,10 @@ def shapes(folder: Path) -> dict[str, Call]:
         "ellipsoid": (geometry.ellipsoid, {"semi_axes": axes, "spacing": 3e-3, "centre": (0.0,) * 3}),
         "polygon": (geometry.polygon, {"corners": square, "spacing": 2e-3}),
         "tube": (geometry.tube, {"radius": 5e-3, "length": 1e-2, "spacing": 3e-3}),
-        "revolved": (geometry.revolved, {"profile": np.array([[0.0, -4e-3], [4e-3, 0.0], [0.0, 4e-3]]), "spacing": 4e-3, "region": 0}),
+        "revolved": (
+            geometry.revolved,
+            {"profile": np.array([[0.0, -4e-3], [4e-3, 0.0], [0.0, 4e-3]]), "spacing": 4e-3, "region": 0},
+        ),
         "labelled": (
             geometry.labelled,
             {"surface": body, "region": 1, "centre": np.array([0.0, 0.0, 7e-3]), "radius": 3e-3},
