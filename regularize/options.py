@@ -17,6 +17,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final, Literal, Self
 
+import numpy as np
+
 from .basis.bspline import DEGREES
 from .basis.sampling import mean_length
 from .errors import InvalidInput
@@ -32,6 +34,7 @@ SAMPLES_PER_KNOT, SAMPLES_OF_LOW_NOISE, LOW_NOISE = 3.0, 2.0, 0.2
 DIVERGENCE = 10.0  # knot distances
 CURVATURE = 3.0  # to a knot distance; the first guess of a search
 Length = float | Literal["auto"]
+MOST_DISTANCE = 1e9  # m or s: beyond it products underflow
 LENGTHS = ("divergence", "curvature", "time_curvature")  # that a number of knots stands for
 AUTOMATIC = (None, "likelihood", "gcv")
 
@@ -157,7 +160,7 @@ class SplineOptions:
             if value is None or (value == BY_DATA and "knots" in name):
                 continue
             each = value if isinstance(value, tuple | list) else (value,)
-            if any(isinstance(one, str) or not 0 < one < float("inf") for one in each):
+            if not all(isinstance(one, int | float | np.number) and 0 < one < MOST_DISTANCE for one in each):
                 raise InvalidInput(f"{name} is {value!r}: it must be a positive distance, in m (time_knots: s)")
 
     def _check_combinations(self) -> None:

@@ -22,7 +22,7 @@ NODES = 5
 def calls(folder: Path) -> dict[str, Call]:
     """Every call by its name: what is called, and the arguments that are put wrong one after the other."""
     measured = recording()
-    return shapes(folder) | motions(measured) | splines() | options() | simulations(measured) | methods(measured)
+    return simulations(measured) | splines() | options() | motions(measured) | shapes(folder) | methods(measured)
 
 
 def recording() -> geometry.Recording:

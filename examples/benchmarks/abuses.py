@@ -11,7 +11,7 @@ limits on time and memory; an abuse ends as
 - obscure: an exception out of the depths, raised by nobody on purpose,
 - crash: the child died, hang: it was stopped.
 
-    python examples/benchmarks/abuses.py [--seconds 600] [--only WORD] [--out abuses.json]
+    python examples/benchmarks/abuses.py [--seconds 600] [--only WORD] [--part 0.2] [--out abuses.json]
 """
 
 from __future__ import annotations
@@ -214,20 +214,26 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=str(__doc__).splitlines()[0])
     parser.add_argument("--seconds", type=float, default=1200.0, help="time budget")
     parser.add_argument("--only", default="", metavar="WORD", help="calls with this in their name")
+    parser.add_argument("--part", type=float, default=1.0, help="part of the abuses that is made, drawn at random")
+    parser.add_argument("--seed", type=int, default=0, help="of that draw")
     parser.add_argument("--out", type=Path, help="every abuse with its outcome, JSON")
     args = parser.parse_args()
     rows: list[dict[str, str]] = []
-    began = time.perf_counter()
+    began, draw = time.perf_counter(), np.random.default_rng(args.seed)
     with tempfile.TemporaryDirectory() as folder:
         for name, (function, sound) in calls(Path(folder)).items():
             if args.only not in name:
                 continue
+            if time.perf_counter() - began > args.seconds:
+                break
             kind, same = in_child(lambda function=function, sound=sound: function(**sound))
             assert kind == "read", (name, kind, same)
             for argument, value in sound.items():
                 for how, other in wrong(value):
                     if time.perf_counter() - began > args.seconds:
                         break
+                    if draw.random() > args.part:
+                        continue
                     given = sound | {argument: other}
                     kind, text = in_child(lambda function=function, given=given: function(**given))
                     if kind == "read":

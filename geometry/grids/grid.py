@@ -17,6 +17,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import embedding_bag
 
+from .given import check_floats, numbers, whole_numbers
+
 OUTSIDE = ("clamp", "zero")
 
 
@@ -45,17 +47,15 @@ class Grid:
     shape: tuple[int, ...]
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "origin", tuple(float(value) for value in self.origin))
-        object.__setattr__(self, "spacing", tuple(float(value) for value in self.spacing))
-        object.__setattr__(self, "shape", tuple(int(value) for value in self.shape))
+        object.__setattr__(self, "origin", numbers("Grid: origin", self.origin))
+        object.__setattr__(self, "spacing", numbers("Grid: spacing", self.spacing))
+        object.__setattr__(self, "shape", whole_numbers("Grid: shape", self.shape))
         if not len(self.origin) == len(self.spacing) == len(self.shape) or len(self.shape) not in (2, 3):
             raise ValueError(
                 f"Grid: origin, spacing and shape must all have 2 or all have 3 numbers, "
                 f"not {len(self.origin)}, {len(self.spacing)} and {len(self.shape)}"
             )
-        if not all(math.isfinite(value) for value in self.origin):
-            raise ValueError(f"Grid: origin must be finite, not {self.origin}")
-        if not all(math.isfinite(value) and value > 0 for value in self.spacing):
+        if not all(value > 0 for value in self.spacing):
             raise ValueError(f"Grid: spacing must be positive and finite (metres), not {self.spacing}")
         if not all(value >= 1 for value in self.shape):
             raise ValueError(f"Grid: every axis needs at least one node, not shape {self.shape}")
@@ -63,7 +63,12 @@ class Grid:
     @classmethod
     def covering(cls, lower: Sequence[float], upper: Sequence[float], spacing: float | Sequence[float]) -> Grid:
         """The smallest grid of this spacing (m) from `lower` that reaches `upper` (D numbers each, m)."""
-        steps = (spacing,) * len(lower) if isinstance(spacing, (int, float)) else tuple(spacing)
+        lower, upper = numbers("Grid.covering: lower", lower), numbers("Grid.covering: upper", upper)
+        each = (spacing,) * len(lower) if isinstance(spacing, (int, float)) else spacing
+        steps = numbers("Grid.covering: spacing", each)
+        if not len(lower) == len(upper) == len(steps):
+            counts = f"{len(lower)}, {len(upper)} and {len(steps)}"
+            raise ValueError(f"Grid.covering: lower, upper and spacing must have as many numbers, not {counts}")
         if not all(step > 0 for step in steps):
             raise ValueError(f"Grid.covering: spacing must be positive, not {spacing}")
         if not all(end >= start for start, end in zip(lower, upper, strict=True)):
@@ -115,6 +120,7 @@ class Grid:
     def contains(self, points: Tensor, *, margin: float = 0.0) -> Tensor:
         """Whether points `(*batch, n, D)` lie in the box grown by `margin` (m): bool `(*batch, n)`."""
         self._check_points(points)
+        (margin,) = numbers("Grid.contains: margin", [margin])
         lower = points.new_tensor(self.origin) - margin
         upper = points.new_tensor(self.upper) + margin
         return ((points >= lower) & (points <= upper)).all(dim=-1)
@@ -158,24 +164,26 @@ class Grid:
         rows = field.reshape(batch, -1, self.size).transpose(1, 2).reshape(batch * self.size, -1)
         rows = rows.contiguous()  # a single field comes as a view, which the look-up reads much slower
         result = embedding_bag(index, rows, per_sample_weights=weight.to(rows.dtype), mode="sum")
-        return result.reshape(batch, count, -1).transpose(1, 2).reshape(*lead, count)
+        return result.reshape(batch, count, rows.shape[1]).transpose(1, 2).reshape(*lead, count)
 
     def spread(self, values: Tensor, points: Tensor | Stencil, *, outside: str = "clamp") -> Tensor:
         """The exact adjoint of `sample`: `values (*lead, n)` added to the nodes around: `(*lead, *shape)`.
 
         `<spread(a), b> = <a, sample(b)>` for every a and b. No division by the cell volume takes place.
         """
+        check_floats("Grid.spread: values", values)
         lead = tuple(values.shape[:-1])
         stencil = points if isinstance(points, Stencil) else self.stencil(points, outside=outside)
         if values.ndim == 0 or values.shape[-1] != stencil.index.shape[-2]:
             raise ValueError(f"Grid.spread: {tuple(values.shape)} values for {stencil.index.shape[-2]} points")
         batch, count, index, weight = self._flat(stencil, lead)
-        rows = values.reshape(batch, -1, count).transpose(1, 2).reshape(batch * count, -1)
+        channels = math.prod(lead[stencil.index.ndim - 2 :])
+        rows = values.reshape(batch, channels, count).transpose(1, 2).reshape(batch * count, channels)
         total = values.new_zeros(batch * self.size, rows.shape[1])
         # One corner at a time: all 2^D at once would need 2^D times the memory.
         for corner in range(index.shape[1]):
             total = total.index_add(0, index[:, corner], rows * weight[:, corner, None].to(rows.dtype))
-        return total.reshape(batch, self.size, -1).transpose(1, 2).reshape(*lead, *self.shape)
+        return total.reshape(batch, self.size, channels).transpose(1, 2).reshape(*lead, *self.shape)
 
     def refined(self, spacing: float | Sequence[float]) -> Grid:
         """A grid of another spacing (m) from the same origin that covers the same box."""
@@ -183,6 +191,7 @@ class Grid:
 
     def padded(self, nodes: int) -> Grid:
         """The same grid with `nodes` more nodes on every side (fewer where negative)."""
+        (nodes,) = whole_numbers("Grid.padded: nodes", [nodes])
         origin = tuple(start - nodes * step for start, step in zip(self.origin, self.spacing, strict=True))
         return Grid(origin, self.spacing, tuple(count + 2 * nodes for count in self.shape))
 
@@ -217,12 +226,12 @@ class Grid:
         return batch, count, index.reshape(-1, corners), stencil.weight.reshape(-1, corners)
 
     def _check_points(self, points: Tensor) -> None:
+        check_floats("Grid: points", points)
         if points.ndim < 2 or points.shape[-1] != self.dimension:
             raise ValueError(f"Grid: points must be (..., n, {self.dimension}), not {tuple(points.shape)}")
-        if not points.is_floating_point():
-            raise ValueError(f"Grid: points must be floating point (metres), not {points.dtype}")
 
     def _lead(self, field: Tensor) -> tuple[int, ...]:
+        check_floats("Grid.sample: the field", field)
         if tuple(field.shape[field.ndim - self.dimension :]) != self.shape or field.ndim < self.dimension:
             raise ValueError(f"Grid.sample: the field's last axes must be {self.shape}, not {tuple(field.shape)}")
         return tuple(field.shape[: field.ndim - self.dimension])

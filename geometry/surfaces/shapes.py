@@ -10,23 +10,28 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from geometry.grids.given import numbers
+
 from .surface import Surface, SurfaceError
+
+# pieces that a side is cut into at most: more than any computer meshes
+_MOST = 20_000
 
 
 def ellipsoid(semi_axes: Sequence[float], spacing: float, centre: Sequence[float] = (0.0, 0.0, 0.0)) -> Surface:
     """An ellipsoid, semi-axes (m) along x, y, z, around `centre`; `spacing` (m) between its vertices."""
     axes = _positive("ellipsoid: semi_axes", semi_axes, 3)
     _positive("ellipsoid: spacing", [spacing], 1)
-    steps = max(3, round(np.pi * float(axes.max()) / spacing))
+    steps = _count(np.pi * float(axes.max()), spacing, 3)
     angle = np.linspace(0, np.pi, steps + 1)
     unit = revolved(np.stack([np.sin(angle), np.cos(angle)], axis=1), spacing / float(axes.max()))
-    return unit.moved(unit.vertices * axes + np.asarray(centre, np.float64))
+    return unit.moved(unit.vertices * axes + _numbers("ellipsoid: centre", centre, 3))
 
 
 def tube(radius: float, length: float, spacing: float) -> Surface:
     """A pipe along z from 0 to `length` (m): wall (region 0), inlet at z = 0 (1), outlet at the end (2)."""
     _positive("tube: radius, length, spacing", [radius, length, spacing], 3)
-    across, along = max(1, round(radius / spacing)), max(1, round(length / spacing))
+    across, along = _count(radius, spacing, 1), _count(length, spacing, 1)
     r = np.concatenate(
         [np.linspace(0, radius, across + 1), np.full(along - 1, radius), np.linspace(radius, 0, across + 1)]
     )
@@ -37,10 +42,10 @@ def tube(radius: float, length: float, spacing: float) -> Surface:
 
 def box(lower: Sequence[float], upper: Sequence[float], spacing: float) -> Surface:
     """A box between two corners (m), its sides cut at about `spacing`; one region, the wall."""
-    first = np.asarray(lower, np.float64)
-    size = _positive("box: upper - lower", np.asarray(upper, np.float64) - first, 3)
+    first = _numbers("box: lower", lower, 3)
+    size = _positive("box: upper - lower", _numbers("box: upper", upper, 3) - first, 3)
     _positive("box: spacing", [spacing], 1)
-    count = np.maximum(np.rint(size / spacing), 1).astype(np.int64)
+    count = np.array([_count(side, spacing, 1) for side in size])
     points: list[np.ndarray] = []
     faces: list[np.ndarray] = []
     for axis in range(3):
@@ -64,7 +69,8 @@ def box(lower: Sequence[float], upper: Sequence[float], spacing: float) -> Surfa
 def ellipse(semi_axes: Sequence[float], spacing: float, centre: Sequence[float] = (0.0, 0.0)) -> Surface:
     """An ellipse in the plane, semi-axes (m) along x and y, as a closed polyline."""
     axes = _positive("ellipse: semi_axes", semi_axes, 2)
-    return polygon(ellipse_rim(axes, spacing) + np.asarray(centre, np.float64), np.inf)
+    _positive("ellipse: spacing", [spacing], 1)
+    return polygon(ellipse_rim(axes, spacing) + _numbers("ellipse: centre", centre, 2), np.inf)
 
 
 def polygon(corners: np.ndarray, spacing: float) -> Surface:
@@ -72,8 +78,10 @@ def polygon(corners: np.ndarray, spacing: float) -> Surface:
     corners = np.asarray(corners, np.float64)
     if corners.ndim != 2 or corners.shape[1] != 2 or len(corners) < 3:
         raise SurfaceError(f"polygon: corners must be (n, 2) with n >= 3, not {corners.shape}")
+    if not np.isfinite(corners).all() or not spacing > 0:
+        raise SurfaceError(f"polygon: corners must be finite and spacing positive (m), got a spacing of {spacing}")
     sides = np.roll(corners, -1, axis=0) - corners
-    count = np.maximum(np.rint(np.linalg.norm(sides, axis=1) / spacing), 1).astype(np.int64)
+    count = [_count(side, spacing, 1) for side in np.linalg.norm(sides, axis=1)]
     pieces = [c + np.arange(n)[:, None] / n * s for c, s, n in zip(corners, sides, count, strict=True)]
     points = np.concatenate(pieces)
     number = np.arange(len(points))
@@ -87,7 +95,7 @@ def ellipse_rim(semi_axes: Sequence[float] | np.ndarray, spacing: float) -> np.n
     fine = np.linspace(0, 2 * np.pi, 2001)
     points = np.stack([semi_axes[0] * np.cos(fine), semi_axes[1] * np.sin(fine)], axis=1)
     length = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
-    count = max(8, round(length[-1] / spacing))
+    count = _count(length[-1], spacing, 8)
     angle = np.interp(np.arange(count) / count * length[-1], length, fine)
     return np.stack([semi_axes[0] * np.cos(angle), semi_axes[1] * np.sin(angle)], axis=1)
 
@@ -101,6 +109,9 @@ def revolved(profile: np.ndarray, spacing: float, region: np.ndarray | int = 0) 
     profile = np.asarray(profile, np.float64)
     if profile.ndim != 2 or profile.shape[1] != 2 or len(profile) < 3:
         raise SurfaceError(f"revolved: profile must be (n, 2) with n >= 3, not {profile.shape}")
+    if not np.isfinite(profile).all():
+        raise SurfaceError("revolved: the profile must be finite (m)")
+    _positive("revolved: spacing", [spacing], 1)
     if np.abs(profile[[0, -1], 0]).max() > 1e-9 * profile[:, 0].max() or (profile[1:-1, 0] <= 0).any():
         raise SurfaceError("revolved: the profile must start and end on the axis and stay off it between")
     rings = [ring_of(radius, z, spacing) for radius, z in profile[1:-1]]
@@ -114,7 +125,7 @@ def revolved(profile: np.ndarray, spacing: float, region: np.ndarray | int = 0) 
 
 def ring_of(radius: float, z: float, spacing: float) -> np.ndarray:
     """Vertices evenly on a circle around z, at least six: `(n, 3)`, m."""
-    count = max(6, round(2 * np.pi * radius / spacing))
+    count = _count(2 * np.pi * radius, spacing, 6)
     angle = 2 * np.pi * np.arange(count) / count
     return np.stack([radius * np.cos(angle), radius * np.sin(angle), np.full(count, z)], axis=1)
 
@@ -136,7 +147,26 @@ def stitched(first: int, count: int, second: int, other: int) -> np.ndarray:
 
 
 def _positive(name: str, values: Sequence[float] | np.ndarray, count: int) -> np.ndarray:
-    array = np.asarray(values, np.float64)
-    if array.shape != (count,) or not (np.isfinite(array) & (array > 0)).all():
+    array = _numbers(name, values, count)
+    if not (array > 0).all():
         raise SurfaceError(f"{name} must be {count} positive lengths (m), not {values}")
     return array
+
+
+def _numbers(name: str, values: Sequence[float] | np.ndarray, count: int) -> np.ndarray:
+    """So many finite numbers (m)."""
+    try:
+        found = np.array(numbers(name, values))
+    except ValueError as fault:
+        raise SurfaceError(str(fault)) from None
+    if len(found) != count:
+        raise SurfaceError(f"{name} must be {count} numbers (m), not {values}")
+    return found
+
+
+def _count(length: float, spacing: float, least: int) -> int:
+    """Pieces of about a spacing (m) that a length (m) is cut into."""
+    pieces = length / spacing if np.isfinite(spacing) else 0.0
+    if not pieces <= _MOST:
+        raise SurfaceError(f"{length:g} m cut at {spacing:g} m gives {pieces:.3g} pieces, more than {_MOST}; both in m")
+    return max(least, round(pieces))

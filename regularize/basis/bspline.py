@@ -15,6 +15,7 @@ import torch
 from regularize.errors import InvalidInput
 
 DEGREES = (1, 2, 3, 4, 5)
+MOST_ORDER = 6  # of derivatives: one more than the highest degree has is 0
 
 
 def _times_linear(poly: list[Fraction], constant: Fraction, slope: Fraction) -> list[Fraction]:
@@ -65,7 +66,15 @@ def derivative_pieces(degree: int, order: int) -> np.ndarray:
 
 
 def basis(t: torch.Tensor, degree: int, order: int = 0) -> torch.Tensor:
-    """Values (..., degree + 1) of the non-zero functions, or of their order-th derivative, at t (...)."""
+    """Values (..., degree + 1) of the non-zero functions, or of their order-th derivative, at t (...).
+
+    Raises:
+        InvalidInput: t is no tensor of real numbers, or there is no such degree or derivative.
+    """
+    if not isinstance(t, torch.Tensor) or not t.is_floating_point():
+        raise InvalidInput(f"t is {getattr(t, 'dtype', type(t).__name__)}: it must be a tensor of real numbers")
+    if not (isinstance(order, int) and 0 <= order <= MOST_ORDER and isinstance(degree, int)):
+        raise InvalidInput(f"degree {degree!r}, order {order!r}: whole numbers, the order from 0 to {MOST_ORDER}")
     table = torch.as_tensor(derivative_pieces(degree, order).copy(), dtype=t.dtype, device=t.device)
     powers = torch.stack([t**k for k in range(table.shape[1])], dim=-1)
     return powers @ table.T

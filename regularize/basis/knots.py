@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import reduce
 
+import numpy as np
 import torch
 
 from regularize.errors import InvalidInput
@@ -33,6 +34,9 @@ class Knots:
             raise InvalidInput(f"degree is {self.degree}: it must be one of {DEGREES}")
         if not len(self.origin) == len(self.spacing) == len(self.cells):
             raise InvalidInput("origin, spacing and cells must have one entry per axis")
+        for name, values in (("origin", self.origin), ("spacing", self.spacing), ("cells", self.cells)):
+            if not all(isinstance(value, int | float | np.number) for value in values):
+                raise InvalidInput(f"{name} is {values!r:.80}: it must hold numbers")
         if not all(0 < step < math.inf for step in self.spacing) or not all(map(math.isfinite, self.origin)):
             raise InvalidInput(
                 f"spacing is {self.spacing}, origin {self.origin}: knot distances must be positive, and all finite"
@@ -41,8 +45,8 @@ class Knots:
             raise InvalidInput(f"cells is {self.cells}: at least one interval per axis is needed")
         if self.nodes > MOST_NODES:
             raise InvalidInput(
-                f"knots of {self.spacing} in {self.cells} cells ask for {self.nodes:.2g} unknowns, more than int32 can "
-                "number: give a larger knot distance (it is in m)"
+                f"knots of {self.spacing} in {self.cells} cells ask for more than the {MOST_NODES} unknowns that "
+                "int32 can number: give a larger knot distance (it is in m)"
             )
 
     @classmethod

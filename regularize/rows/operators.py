@@ -15,6 +15,8 @@ import torch
 from regularize.basis.knots import Knots
 from regularize.errors import InvalidInput
 
+from .given import check_real
+
 CHUNK = 4096  # points per pass: bounds the (points, local_size, C) buffers to a few megabytes
 
 
@@ -53,10 +55,9 @@ class PointRows:
     target: torch.Tensor  # (rows,), already weighted
 
     def __init__(self, knots: Knots, points: torch.Tensor, components: int) -> None:
+        check_real("points", points)
         if points.ndim != 2 or points.shape[1] != knots.axes:
             raise InvalidInput(f"points have shape {tuple(points.shape)}: expected (n, {knots.axes})")
-        if not points.is_floating_point() or points.device.type == "meta":
-            raise InvalidInput(f"points are of {points.dtype} on '{points.device}': expected real coordinates, m")
         if not bool(torch.isfinite(points).all()):
             raise InvalidInput("points must be finite: leave out those that are not")
         self.knots, self.components = knots, components
@@ -85,11 +86,11 @@ class VectorRows(PointRows):
     """Rows w_ik v_k(x_i) = w_ik target_ik, one per point and component (the matrix S of Grønli 2017, eq. 3.7)."""
 
     def __init__(self, knots: Knots, points: torch.Tensor, target: torch.Tensor, weight: torch.Tensor) -> None:
+        for name, values in (("points", points), ("target", target), ("weight", weight)):
+            check_real(name, values)
         if target.ndim != 2 or len(target) != len(points):
             raise InvalidInput(f"target has the shape {tuple(target.shape)}: it must be ({len(points)}, C)")
-        if tuple(weight.shape) not in {(), (1,), (len(target), 1), tuple(target.shape)}:
-            rule = f"it must be ({len(target)}, 1) or {tuple(target.shape)}"
-            raise InvalidInput(f"weight has the shape {tuple(weight.shape)}: {rule}")
+        check_real("weight", weight, ((len(target), 1), tuple(target.shape), (1,), ()))
         super().__init__(knots, points, target.shape[1])
         self.weight = weight.expand(target.shape)
         self.target = (self.weight * target).flatten()
@@ -167,6 +168,7 @@ class _CoupledRows(PointRows):
         self, knots: Knots, points: torch.Tensor, components: int, target: torch.Tensor, weight: torch.Tensor
     ) -> None:
         super().__init__(knots, points, components)
+        check_real("weight", weight, ((len(points),), (1,), ()))
         self.weight = weight.expand(len(points))
         self.target = self.weight * target
 
@@ -197,6 +199,10 @@ class DirectionRows(_CoupledRows):
         target: torch.Tensor,
         weight: torch.Tensor,
     ) -> None:
+        for name, values in (("points", points), ("direction", direction), ("target", target)):
+            check_real(name, values)
+        if not bool(torch.isfinite(direction).all()):
+            raise InvalidInput("direction must be finite: leave out the rows whose direction is not known")
         if direction.ndim != 2 or len(direction) != len(points) or target.shape != points[:, 0].shape:
             raise InvalidInput(
                 f"directions of the shape {tuple(direction.shape)} and targets of {tuple(target.shape)}: they must be "
@@ -214,7 +220,8 @@ class DivergenceRows(_CoupledRows):
     """Rows w_i div v(x_i) = 0, derivatives per metre (Grønli 2017, eq. 3.13)."""
 
     def __init__(self, knots: Knots, points: torch.Tensor, components: int, weight: torch.Tensor) -> None:
-        super().__init__(knots, points, components, torch.zeros_like(points[:, 0]), weight)
+        check_real("points", points)
+        super().__init__(knots, points, components, points.new_zeros(points.shape[:1]), weight)
 
     def rows_at(self, index: slice | torch.Tensor) -> torch.Tensor:
         """(n, local_size, C), 1/m, unweighted."""

@@ -8,7 +8,19 @@ from collections.abc import Callable
 import pytest
 import torch
 
-from regularize import CellRows, DirectionRows, Factor, InvalidInput, Knots, PreparedSystem, System, VectorRows
+from regularize import (
+    CellRows,
+    DirectionRows,
+    DivergenceRows,
+    Factor,
+    InvalidInput,
+    Knots,
+    PreparedSystem,
+    Smoother,
+    System,
+    VectorRows,
+    basis,
+)
 from regularize.native import library as native
 from regularize.solvers.direct import solve_direct
 
@@ -41,16 +53,32 @@ REFUSED: dict[str, tuple[Callable[[], object], str]] = {
     "other knots": (lambda: system(rows(), knots=FINER), "made for other knots"),
     "no row": (lambda: system(rows(points=POINTS[:0], values=VALUES[:0])), "blocks without any row"),
     "damping": (lambda: system(damping=math.nan), "finite damping"),
-    "meta rows": (lambda: system(rows(points=POINTS.to("meta"))), "points are of .* on 'meta'"),
+    "meta rows": (lambda: system(rows(points=POINTS.to("meta"))), "points must be a dense tensor .* on 'meta'"),
     "points far away": (lambda: rows(points=FAR), "points must be finite"),
-    "whole points": (lambda: rows(points=POINTS.long()), "points are of torch.int64"),
+    "whole points": (
+        lambda: rows(points=POINTS.long()),
+        "dense tensor of real numbers, not .* torch.int64",
+    ),
     "values": (lambda: system(rows(values=math.nan * VALUES)), "target or weight that is not finite"),
     "fewer values": (lambda: rows(values=VALUES[:5]), r"target has the shape \(5, 3\): it must be \(40, C\)"),
     "directions": (lambda: DirectionRows(KNOTS, POINTS, VALUES[:3], VALUES[:, 0], ONES[:, 0]), r"\(40, C\) and"),
+    "other weights": (lambda: VectorRows(KNOTS, POINTS, VALUES, ONES[:, 0]), r"weight has the shape \(40,\)"),
+    "sparse weights": (lambda: VectorRows(KNOTS, POINTS, VALUES, ONES.to_sparse()), "weight must be a dense tensor"),
+    "no direction": (
+        lambda: DirectionRows(KNOTS, POINTS, FAR, VALUES[:, 0], ONES[:, 0]),
+        "direction must be finite",
+    ),
+    "weights of a divergence": (lambda: DivergenceRows(KNOTS, POINTS, 3, ONES[:5, 0]), r"must be \(40,\)"),
+    "points of a divergence": (lambda: DivergenceRows(KNOTS, POINTS[:, 0], 3, ONES[:, 0]), r"expected \(n, 3\)"),
+    "knots of text": (lambda: Knots(("0", 0.0, 0.0), (0.005,) * 3, (2, 2, 2)), "origin is .* it must hold numbers"),
+    "endless order": (lambda: basis(torch.zeros(1), 3, 2**63), "the order from 0 to 6"),
+    "endless knots": (lambda: Smoother(knots=1e300), "knots is 1e.300: it must be a positive distance"),
+    "divergence nowhere": (lambda: Smoother().fit(POINTS, VALUES, divergence_points=FAR), "points hold NaN or inf"),
+    "samples of text": (lambda: Smoother().fit(POINTS, "fast"), "velocity must be a tensor, not str"),
     "cells": (lambda: system(CellRows(KNOTS, CELLS, ONES.new_ones(2, 64), 3)), "cells .99, 99, 99. to"),
     "factor of cells": (lambda: CellRows(KNOTS, CELLS, ONES, 3), r"it must be \(rows, 64\)"),
     "knots": (lambda: Knots((math.nan,) * 3, (0.005,) * 3, (2, 2, 2)), "all finite"),
-    "many knots": (lambda: Knots((0.0,) * 3, (1e-9,) * 3, (10**4,) * 3), "more than int32"),
+    "many knots": (lambda: Knots((0.0,) * 3, (1e-9,) * 3, (10**4,) * 3), "than the .* that int32 can number"),
     "short band": (lambda: Factor(BAND[:5].clone(), ORDERING), "a row for each component of the"),
     "narrow band": (lambda: Factor(BAND[:, :5].clone(), ORDERING), "the band is 5 wide, but its columns reach"),
     "whole band": (lambda: Factor(BAND.long(), ORDERING), "the band is of torch.int64"),

@@ -12,6 +12,7 @@ import geometry
 from torchsph.pairs.moving_least_squares import Fetched
 
 from .simulator import Simulation, Simulator
+from .transfer.checks import check_grid
 
 
 @dataclass(frozen=True)
@@ -67,6 +68,10 @@ class GridForecast:
         seed: int = 0,
         rates: bool = False,
     ) -> None:
+        check_grid(grid, model.scene.dimension)
+        if not isinstance(velocity, Tensor) or not isinstance(transfer, Transfer):
+            kinds = f"{type(velocity).__name__} and {type(transfer).__name__}"
+            raise TypeError(f"GridForecast needs a velocity that is a tensor and a Transfer, got {kinds}")
         batched = velocity if velocity.ndim == grid.dimension + 2 else velocity[None]
         self.grid, self.transfer, self.start_time = grid, transfer, time
         self.run: Simulation = model.start(time, members=batched.shape[0], seed=seed)

@@ -214,6 +214,11 @@ class Scene:
     dimension: int = 3
 
     def __post_init__(self) -> None:
+        if not isinstance(self.valves, tuple | list) or not all(isinstance(one, Valve) for one in self.valves):
+            raise TypeError(f"Scene.valves must be a tuple of Valve, got {self.valves!r:.60}")
+        for name in ("spacing", "reference_speed"):
+            if not isinstance(getattr(self, name), int | float | np.number):
+                raise TypeError(f"Scene.{name} must be one number, got {getattr(self, name)!r:.60}")
         if not 0 < self.spacing < math.inf:
             raise ValueError(f"Scene.spacing must be positive and finite (m), got {self.spacing}")
         if self.dimension not in (2, 3):

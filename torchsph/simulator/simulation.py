@@ -15,12 +15,15 @@ from torchsph.pairs.moving_least_squares import Fetched
 from .advancing import AdvancingRun
 from .scene import Scene
 from .schemes.scheme import Scheme
+from .state.checks import check_count
 from .state.particles import Particles
 from .stepping.coefficients import Coefficients
 from .stepping.pressure import Neighbourhood, divergence_free
 from .transfer.checks import check_grid, check_mask, check_some, check_velocity, check_weight
 from .transfer.fetching import fetch_on_grid
 from .transfer.imposing import pulled
+
+MOST_PROJECTIONS = 1000
 
 
 class Model(Protocol):
@@ -124,6 +127,7 @@ class Simulation(AdvancingRun):
         """
         if not self.can_project:
             raise ValueError("projecting velocities needs complete-kernel walls; potential walls have no kernel share")
+        times = check_count(times, "times must be at least one projection", MOST_PROJECTIONS)
         self.surroundings.enter(self.time, self.time)
         wall = self.surroundings.sample(self.particles)
         search = self._stepper.pair_search

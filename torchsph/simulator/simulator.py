@@ -14,7 +14,7 @@ from .schemes.presets import preset
 from .schemes.scheme import Scheme
 from .seeding import Seeding, seed_particles
 from .simulation import Simulation
-from .state.checks import check_arrays, check_seed, check_time, check_values, usable_device
+from .state.checks import check_arrays, check_count, check_seed, check_time, check_values, usable_device
 from .state.particles import Particles
 from .state.units import Units
 
@@ -65,8 +65,7 @@ class Simulator:
             ValueError: no member, a time that is not finite or at which the wall is not known.
         """
         time = check_time(time, "time")
-        if int(members) != members or members < 1:
-            raise ValueError(f"a simulation needs at least one member, a whole number of them, got {members}")
+        members = check_count(members, "a simulation needs at least one member")
         label = (time, check_seed(seed))
         if label not in self._seeded:
             generator = torch.Generator(device=self.device).manual_seed(label[1])

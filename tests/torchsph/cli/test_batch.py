@@ -6,6 +6,7 @@ import csv
 import json
 import os
 import signal
+import socket
 import subprocess
 import threading
 from collections.abc import Callable
@@ -19,6 +20,7 @@ from torchsph.cli import main
 from torchsph.cli.commands import batch
 from torchsph.cli.running import child
 from torchsph.cli.running.child import Outcome, run_child
+from torchsph.cli.running.folder_lock import NAME
 from torchsph.cli.running.items import listed
 from torchsph.cli.running.stopping import StopSignals
 from torchsph.methods.runtime.watching import Stopped
@@ -107,6 +109,18 @@ def test_a_failed_item_costs_itself_alone_and_a_done_one_is_not_done_again(recor
     known = {name: value for name, value in spline.items() if value is not None}
     assert known and {name: float(rows[1][name]) for name in known} == pytest.approx(known)
     assert rows[1]["fingerprint"] == account["fingerprint"]
+
+
+def test_a_killed_item_leaves_no_lock(recordings, tmp_path, monkeypatch):
+    folder = tmp_path / "out" / "a"
+
+    def killed(line: list[str], log: Path, limit: float | None) -> Outcome:
+        (folder / NAME).write_text(json.dumps({"host": socket.gethostname(), "pid": 1, "started": "today"}))
+        return Outcome(3, 1.0, "was killed")
+
+    monkeypatch.setattr(batch, "run_child", killed)
+    assert main(["batch", str(recordings / "a.h5"), "--out", str(tmp_path / "out")]) == 3
+    assert list(folder.iterdir()) == []
 
 
 def test_an_interrupted_item_goes_on(recordings, tmp_path, monkeypatch):

@@ -212,7 +212,8 @@ def test_the_status_tells_how_far_a_run_is(tmp_path):
         (1, 4, 3, 3),
         (2, 4, 2, 3),
     ]
-    assert lines[2]["left"] == pytest.approx(2 * 0.02, rel=0.9) and lines[2]["end"] >= lines[2]["time"]
+    done = lines[2]["seconds"]  # of two frames of four: as much is left, less what passed before the first one began
+    assert 2 * 0.02 <= lines[2]["left"] <= done and lines[2]["end"] >= lines[2]["time"]
     assert lines[-1]["code"] == 75 and lines[-1]["seconds"] > 0.04
     assert all(line["peak"] >= line["memory"] * 0.9 > 1e7 for line in lines)
 

@@ -15,6 +15,7 @@ from ..exit_codes import ExitCode
 from ..outputs import output_folder, write_json
 from ..printing import print_table, say
 from ..running.child import Outcome, run_child
+from ..running.folder_lock import swept
 from ..running.isolated import SECONDS_TO_READ, isolated, memory_to_read
 from ..running.items import Item, listed
 from ..running.provenance import fingerprint, input_digests
@@ -73,6 +74,7 @@ def _run(item: Item, args: argparse.Namespace) -> tuple[Outcome, str]:
         if (item.folder / "checkpoint.pt").exists():
             line.append("--resume")
         outcome = run_child(line, item.folder / "log.txt", args.time_limit)
+        swept(item.folder)
     except (ValueError, OSError) as fault:
         return Outcome(ExitCode.INPUT, 0.0, str(fault)), FAILED
     except MemoryError as fault:

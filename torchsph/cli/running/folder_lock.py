@@ -42,6 +42,13 @@ def locked(folder: str | Path) -> Iterator[Path]:
                 folder.rmdir()
 
 
+def swept(folder: Path) -> None:
+    """Remove the lock that a run has left which was killed in the folder; one that is held stays."""
+    if (folder / NAME).exists():
+        with suppress(ValueError, OSError), locked(folder):
+            pass
+
+
 def _taken(path: Path) -> int | None:
     """The handle that holds the lock; None on a file system without locks, where the file alone has to do."""
     while True:

@@ -23,6 +23,8 @@ def expect(name: str, array: Tensor, shape: tuple[int, ...], dtype: torch.dtype 
         raise ValueError(f"{name} must have the shape ({wanted}), got {tuple(array.shape)}")
     if dtype is not None and array.dtype != dtype:
         raise TypeError(f"{name} must be of {dtype}, got {array.dtype}")
+    if array.layout != torch.strided:
+        raise TypeError(f"{name} must be a dense tensor, got one of layout {array.layout}; use to_dense()")
 
 
 def check_particles(position: Tensor, member: Tensor, names: tuple[str, str] = ("position", "member")) -> None:

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from torchsph.pairs.backends.checks import expect
 
 from .particles import CHANNEL, RESERVOIR, Particles
+
+# each holds all particles: more fit into no machine
+MOST_MEMBERS = 2**16
 
 
 def check_time(time: float, name: str) -> float:
@@ -38,9 +42,29 @@ def check_seed(seed: int) -> int:
     Raises:
         ValueError: it is none.
     """
-    if int(seed) != seed or not -(2**63) <= seed < 2**64:
-        raise ValueError(f"seed must be a whole number of at most 64 bits, got {seed}")
+    if not _is_whole(seed) or not -(2**63) <= seed < 2**64:
+        raise ValueError(f"seed must be a whole number of at most 64 bits, got {seed!r}")
     return int(seed)
+
+
+def check_count(count: int, name: str, most: int = MOST_MEMBERS) -> int:
+    """A whole number of things, at least one.
+
+    Args:
+        count: as given.
+        name: what is counted, which opens the message.
+        most: of them.
+
+    Raises:
+        ValueError: it is none.
+    """
+    if not _is_whole(count) or not 1 <= count <= most:
+        raise ValueError(f"{name}, a whole number of them up to {most}, got {count!r}")
+    return int(count)
+
+
+def _is_whole(value: object) -> bool:
+    return isinstance(value, int | float | np.number) and math.isfinite(value) and int(value) == value
 
 
 def usable_device(name: str | torch.device) -> str:
@@ -80,7 +104,8 @@ def check_arrays(particles: Particles, dimension: int, dtype: torch.dtype, devic
     whole = {"member": (count,), "kind": (count,), "label": (count,)}
     shapes = {"position": (count, dimension), "velocity": (count, dimension)}
     kind = torch.device(device).type
-    for name, array in particles.arrays().items():
+    needed = dict.fromkeys(("position", "velocity", "deviation", "mass", "member", "kind"))
+    for name, array in (needed | particles.arrays()).items():
         if not isinstance(array, Tensor):
             raise TypeError(f"the particles' {name} must be a tensor, got {type(array).__name__}")
         expect(f"the particles' {name}", array, shapes.get(name, (count,)), torch.int64 if name in whole else dtype)

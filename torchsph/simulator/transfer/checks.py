@@ -17,8 +17,11 @@ def check_grid(grid: Grid, dimension: int) -> None:
         dimension: of the run.
 
     Raises:
+        TypeError: it is no grid.
         ValueError: they differ.
     """
+    if not isinstance(grid, Grid):
+        raise TypeError(f"grid must be a geometry.Grid, got {type(grid).__name__}")
     if grid.dimension != dimension:
         raise ValueError(
             f"a grid of {grid.dimension} dimensions, {grid.shape}, was given to a simulation of {dimension}; use the "
@@ -117,6 +120,8 @@ def _check_tensor(name: str, array: Tensor) -> None:
         raise TypeError(f"{name} must be a tensor, got {type(array).__name__}")
     if array.device.type == "meta":
         raise ValueError(f"{name} is on the device 'meta', where tensors hold no numbers")
+    if array.layout != torch.strided:
+        raise TypeError(f"{name} must be a dense tensor, got one of layout {array.layout}; use to_dense()")
 
 
 def _first(bad: Tensor) -> tuple[int, ...]:
