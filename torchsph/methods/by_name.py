@@ -134,8 +134,6 @@ def run_methods(
     predicted_memory(prepared, methods, preset, models.spacing, count, also).refuse_beyond(free_memory())
     ensemble = None
     if "ensemble" in methods:
-        if resume is True and checkpoints is not None and is_lead():
-            resume = Saved.read(Path(checkpoints)) or True
         ensemble = _EnsembleCall(
             prepared,
             models,
@@ -144,7 +142,7 @@ def run_methods(
             options=EnsembleOptions(lag=lag, minimum_members=minimum_members),
             truth=truth,
             checkpoints=None if checkpoints is None else Path(checkpoints),
-            resume=resume,
+            resume=_read_once(resume, checkpoints),
             seed=seed,
             quantities="ensemble" in quantities,
             keep_members=keep_members,
@@ -294,6 +292,13 @@ def _check(methods: Sequence[str], measured: geometry.Recording) -> None:
         raise ValueError(f"unknown method {', '.join(unknown)}; known: {', '.join(METHODS)}")
     if "sph" in methods:
         geometry.measurement_type(measured).require_full("method sph imposes")
+
+
+def _read_once(resume: bool | Saved, checkpoints: str | Path | None) -> bool | Saved:
+    """What to go on from, its file read by the first process before any work."""
+    if resume is True and checkpoints is not None and is_lead():
+        return Saved.read(Path(checkpoints)) or True
+    return resume
 
 
 def _drawn(prepared: PreparedMeasurement, count: int, seed: int) -> MemberCurves:

@@ -42,8 +42,8 @@ def spline_frames(
     """
     if members < 2:
         raise ValueError(f"a spread needs at least 2 members, not {members}")
-    events = np.unique(smoothed.valve_intervals_or_derived()[:, 1:])
-    events = [float(t) for t in events[np.isfinite(events)]]
+    changes = np.unique(smoothed.valve_intervals_or_derived()[:, 1:])
+    events = [float(t) for t in changes[np.isfinite(changes)]]
     held: deque[NDArray[np.float32]] = deque()
     first = 0  # frame of the first field that is held
     for frame in range(smoothed.frames):

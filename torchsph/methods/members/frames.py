@@ -122,7 +122,7 @@ class MemberFrames:
     def restore(self, state: dict[str, Any]) -> None:
         """Go on from what ``state`` gave."""
         self._frame, self._before, self._pending = state["frame"], state["before"], state["pending"]
-        for observer, kept in zip(self.observers, state["observers"], strict=True):
+        for observer, kept in zip(self.observers, state["observers"], strict=True) if is_lead() else ():
             observer.restore(kept)
 
     @staticmethod

@@ -131,7 +131,8 @@ class MemberQuantities:
 
     def state(self) -> dict[str, Any]:
         """What a checkpoint has to hold."""
-        kept = {"curves": self._curves, "pressure": self._pressure, "sigma": self._sigma}
+        kept: dict[str, list[Any]] = {"curves": self._curves, "pressure": self._pressure}
+        kept["sigma"] = self._sigma
         tensors = {name: [torch.from_numpy(np.array(each)) for each in values] for name, values in kept.items()}
         return {**tensors, "fault": self.fault}
 
