@@ -134,8 +134,6 @@ def run_methods(
     predicted_memory(prepared, methods, preset, models.spacing, count, also).refuse_beyond(free_memory())
     ensemble = None
     if "ensemble" in methods:
-        if resume is True and checkpoints is not None and is_lead():
-            resume = Saved.read(Path(checkpoints)) or True
         ensemble = _EnsembleCall(
             prepared,
             models,
