@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 
 from geometry.grids.grid import Grid
+from geometry.recordings.odd_files import PACKED, UNWRITTEN
 from geometry.recordings.units import factor
 
 from .field_map import FieldMap
@@ -15,6 +17,7 @@ from .orientation import Orientation
 from .source import ArrayLike, FormatError, Source
 
 MIRROR = {"ras": np.array([-1.0, -1.0, 1.0])}  # to LPS, the coordinates that DICOM, ITK and surfaces of Slicer use
+WHOLE = (".h5", ".hdf5", ".hdf", ".he5", ".mat", ".npz", ".vtkhdf", ".nc", ".nc4", ".nii", ".gz", ".nrrd", ".mha")
 DECLARED = 64 * 2**30  # bytes; a file that claims a larger result is refused before anything is read
 
 
@@ -56,10 +59,7 @@ def assemble(source: Source, said: FieldMap) -> Fields:
     _check_components(source, names, sizes, dimension)
     counts = tuple(sizes[0][letter] for letter in "xyz"[:dimension])
     frames = sizes[0].get("t", 1)
-    if 4 * dimension * frames * int(np.prod(counts)) > DECLARED:
-        raise FormatError(
-            f"{source.path}: {names[0]}: claims {frames} frames of {counts} nodes, more than memory holds"
-        )
+    _check_size(source, names[0], 4 * dimension * frames * int(np.prod(counts)), f"{frames} frames of {counts} nodes")
     lie = Orientation.of(_affine(source, said, counts), counts, source.path)
     grid = Grid(tuple(lie.origin), tuple(lie.spacing), tuple(counts[lie.order[a]] for a in reversed(range(dimension))))
     matrix = _matrix(source, said, lie)
@@ -149,6 +149,18 @@ def _check_components(source: Source, names: Sequence[str], sizes: list[dict[str
         )
 
 
+def _check_size(source: Source, name: str, needed: int, claimed: str) -> None:
+    """Refuse, before anything is read, a result larger than memory or than the file can have packed."""
+    if needed > DECLARED:
+        raise FormatError(f"{source.path}: {name}: claims {claimed}, more than memory holds")
+    path = Path(source.path)
+    if path.suffix.lower() in WHOLE and path.is_file() and needed > UNWRITTEN + PACKED * path.stat().st_size:
+        raise FormatError(
+            f"{source.path}: {name}: claims {claimed}, but the whole file has {path.stat().st_size} bytes; write the "
+            "values, or name other arrays"
+        )
+
+
 def _affine(source: Source, said: FieldMap, counts: tuple[int, ...]) -> np.ndarray:
     """From node numbers to places in metres, in LPS where the file is of a patient."""
     dimension = len(counts)
@@ -223,15 +235,20 @@ def _fill(
     matrix: np.ndarray,
     unit: float | None,
 ) -> None:
-    """Write a vector field into `result`, (T, D, *grid), frame by frame and component by component."""
+    """Write a vector field into `result`, (T, D, *grid), frame by frame and component by component.
+
+    Components that lie apart in the file come one after the other, so that each array is read from front to back.
+    """
     result[...] = 0
-    for frame in range(len(result)):
-        for component in range(result.shape[1]):
-            name, letters = (names[0], axes[0]) if len(names) == 1 else (names[component], axes[component])
-            values = lie.field(_slab(source, name, letters, frame, component))
-            values = values * (unit or _stated(source, name))
-            for axis in np.flatnonzero(matrix[:, component]):
-                result[frame, axis] += np.asarray(matrix[axis, component] * values, np.float32)
+    frames, components = range(len(result)), range(result.shape[1])
+    apart = len(names) > 1 or -1 < axes[0].find("c") < axes[0].find("t")
+    pairs = [(f, c) for c in components for f in frames] if apart else [(f, c) for f in frames for c in components]
+    for frame, component in pairs:
+        name, letters = (names[0], axes[0]) if len(names) == 1 else (names[component], axes[component])
+        values = lie.field(_slab(source, name, letters, frame, component))
+        values = values * (unit or _stated(source, name))
+        for axis in np.flatnonzero(matrix[:, component]):
+            result[frame, axis] += np.asarray(matrix[axis, component] * values, np.float32)
 
 
 def _slab(source: Source, name: str, letters: str, frame: int, component: int) -> np.ndarray:

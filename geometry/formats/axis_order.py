@@ -16,8 +16,8 @@ from .source import FormatError, Source
 ORDERS = ("zyx", "xyz", "yxz", "zxy", "xzy", "yzx")
 
 
-def in_best_order(source: Source, said: FieldMap) -> Fields:
-    """The fields of a file, read once, with their axes taken in the order of least divergence.
+def in_best_order(source: Source, said: FieldMap) -> tuple[Fields, str]:
+    """The fields of a file, read once, in the order of axes of least divergence, and that order.
 
     The derivatives along the stored axes and their products give the divergence of every order; spacings belong to x,
     y, z and so do components, whatever axis they turn out to be.
@@ -43,7 +43,7 @@ def in_best_order(source: Source, said: FieldMap) -> Fields:
         axes = "zyx"
     rest = ", ".join(f"{one} {score:.2g}" for one, score in scores.items() if one != axes)
     note = f"axes taken as {axes}: divergence {scores[axes]:.2g} of the gradient ({rest})"
-    return replace(_reordered(stored, axes), notes=[*stored.notes, note])
+    return replace(_reordered(stored, axes), notes=[*stored.notes, note]), axes
 
 
 def _divergence(products: np.ndarray, axes: str, spacing: tuple[float, ...]) -> float:

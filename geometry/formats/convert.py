@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import h5py
@@ -15,12 +15,11 @@ from geometry.recordings.recording import Recording
 from geometry.recordings.units import factor
 from geometry.surfaces.files import SUFFIXES
 
-from .assemble import Fields, assemble
-from .axis_order import in_best_order
+from .assemble import Fields
 from .field_map import FieldMap
 from .readers.hdf5 import text
-from .registry import open_source
-from .source import FormatError, Source
+from .series import read_fields
+from .source import FormatError
 from .walls import inside_at, wall_from_files, wall_from_mask
 
 
@@ -108,7 +107,7 @@ def convert(
         return _walls_alone(paths, said, wall, about, text_of)
     if len(paths) == 1 and not format and _is_recording(paths[0]):
         return Converted(read_recording(paths[0]))
-    fields = _fields(paths, said, format)
+    fields = read_fields(paths, said, format)
     return _walled(fields, said, wall, about, text_of)
 
 
@@ -117,102 +116,6 @@ def _is_recording(path: Path) -> bool:
         return False
     with h5py.File(path, "r") as file:
         return text(file.attrs.get("format", "")) == "recording"
-
-
-def _fields(paths: Sequence[Path], said: FieldMap, format: str) -> Fields:
-    """The fields of all files, with the order of axes of least divergence where that is asked for."""
-    sources = [open_source(path, said, format) for path in paths]
-    try:
-        if len(sources) == 1:
-            return _ordered(sources[0], said)
-        together = _merged(sources, said)
-        if together is not None:
-            return _ordered(together, said)
-        return _joined(
-            [
-                _ordered(source, replace(said, interval=None, time=(0.0,)) if _timeless(source) else said)
-                for source in sources
-            ],
-            said,
-            [str(path) for path in paths],
-        )
-    finally:
-        for source in sources:
-            source.close()
-
-
-def _timeless(source: Source) -> bool:
-    return source.time is None
-
-
-def _ordered(source: Source, said: FieldMap) -> Fields:
-    """Assembled; with `axes="auto"` in the order of axes that has the least divergence."""
-    return in_best_order(source, said) if said.axes == "auto" else assemble(source, said)
-
-
-def _merged(sources: Sequence[Source], said: FieldMap) -> Source | None:
-    """All arrays of several files as of one, where the field map names arrays that lie in different ones."""
-    arrays = {name: (source, array) for source in sources for name, array in source.arrays.items()}
-    wanted = [name for name in (*said.velocity, said.mask, said.weight, *said.sigma) if name]
-    if sum(len(source.arrays) for source in sources) != len(arrays) or not wanted:
-        return None
-    if all(name in sources[0].arrays for name in wanted) or not all(name in arrays for name in wanted):
-        return None
-    first = next(source for source in sources if wanted[0] in source.arrays)
-    for source in sources:
-        if (
-            first.affine is not None
-            and source.affine is not None
-            and not (
-                source.affine.shape == first.affine.shape
-                and np.allclose(source.affine, first.affine, rtol=1e-4, atol=1e-4)
-            )
-        ):
-            raise FormatError(f"{source.path}: lies elsewhere than {first.path}; resample it to the same grid")
-
-    def gathered(of: str) -> dict:
-        merged: dict = {}
-        for source in sources:
-            merged |= dict(getattr(source, of))
-        return merged
-
-    return replace(
-        first,
-        arrays={name: array for name, (_, array) in arrays.items()},
-        attributes=gathered("attributes"),
-        axes=gathered("axes"),
-        roles=gathered("roles"),
-    )
-
-
-def _joined(parts: Sequence[Fields], said: FieldMap, names: Sequence[str]) -> Fields:
-    """The frames of several files in a row."""
-    first = parts[0]
-    for part, name in zip(parts, names, strict=True):
-        if part.grid.shape != first.grid.shape or not np.allclose(part.grid.origin, first.grid.origin, atol=1e-9):
-            raise FormatError(f"{name}: has another grid than {names[0]}; the frames of a series share theirs")
-
-    def row(of: str) -> np.ndarray | None:
-        values = [getattr(part, of) for part in parts]
-        return None if any(value is None for value in values) else np.concatenate(values)
-
-    time = np.concatenate([part.time for part in parts])
-    if isinstance(said.time, tuple) and said.time:
-        time = np.asarray(said.time) * (said.unit("time") or 1.0)
-    elif said.interval is not None:
-        time = said.interval * np.arange(len(time))
-    elif (np.diff(time) <= 0).any():
-        if not said.period:
-            raise FormatError(f"{names[0]}: when were the {len(time)} frames? Say it (--interval S or --period S)")
-        time = said.period * np.arange(len(time)) / len(time)
-    return replace(
-        first,
-        time=time,
-        velocity=np.concatenate([part.velocity for part in parts]),
-        mask=row("mask"),
-        weight=row("weight"),
-        sigma=row("sigma"),
-    )
 
 
 def _walled(fields: Fields, said: FieldMap, options: WallOptions, about: _Constants, description: str) -> Converted:

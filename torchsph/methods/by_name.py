@@ -262,9 +262,8 @@ class _EnsembleCall:
 
     def run(self, watcher: Watcher | None, progress: bool) -> tuple[EnsembleRun, MemberCurves | None]:
         """The ensemble's analyses, and what its members give where it is asked for."""
-        read: list[FrameObserver] = []
-        if self.quantities:
-            read.append(MemberQuantities(self.prepared.recording))
+        quantities = MemberQuantities(self.prepared.recording, strict=False) if self.quantities else None
+        read: list[FrameObserver] = [] if quantities is None else [quantities]
         if self.keep_members is not None:
             read.append(MemberFile(self.keep_members, self.prepared.recording, self.members))
         run = assimilate(
@@ -282,10 +281,9 @@ class _EnsembleCall:
             progress=progress,
             observers=read,
         )
-        if not self.quantities or not is_lead():
+        if quantities is None or quantities.fault is not None or not is_lead():
             return run, None
-        curves = read[0].found() if isinstance(read[0], MemberQuantities) else None
-        return run, curves
+        return run, quantities.found()
 
 
 def _check(methods: Sequence[str], measured: geometry.Recording) -> None:

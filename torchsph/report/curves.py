@@ -1,8 +1,7 @@
 """Curves over time for a page: quantities of a flow with their bands, and measures of the methods.
 
-Quantities come as `torchsph quantify` writes them: for each source (`analysis`, `truth`) and each name either the
-values over time, or a mapping with `mean` (or `value`) and, from members, `p05` and `p95`, and perhaps a `time` of its
-own.
+Quantities come as `torchsph quantify` and `assimilate` write them: for each source (`analysis`, `truth`) and each name
+the values over time, and of the members for each name a mapping with `mean`, `low` and `high`.
 """
 
 from __future__ import annotations
@@ -97,7 +96,11 @@ def curves_of(quantities: Mapping[str, Any]) -> list[Curve]:
     Args:
         quantities: `quantities.json`, read or as it is about to be written. What is not understood of it is left out.
     """
-    units, sources = _mapping(quantities.get("units")), _mapping(quantities.get("curves"))
+    units, sources = _mapping(quantities.get("units")), dict(_mapping(quantities.get("curves")))
+    members = _mapping(_mapping(quantities.get("members")).get("curves"))
+    if members:
+        truth = {"truth": sources.pop("truth")} if "truth" in sources else {}
+        sources |= {"members": members} | truth
     time = _array(quantities.get("time", quantities.get("times")))
     found: dict[str, list[Line]] = {}
     for source, curves in sources.items():
@@ -116,10 +119,48 @@ def _line(source: str, values: Any, time: np.ndarray | None) -> Line | None:
     middle = _array(given.get("mean", given.get("value")) if given else values)
     if time is None or middle is None or time.shape != middle.shape:
         return None
-    low, high = (_array(given.get(name)) for name in ("p05", "p95"))
+    low, high = (_array(given.get(name)) for name in ("low", "high"))
     if low is None or high is None or not low.shape == high.shape == middle.shape:
         low = high = None
     return Line(source, time, middle, low, high)
+
+
+def beat_table(quantities: Mapping[str, Any]) -> list[list[str]]:
+    """Heading and rows of the numbers of the beat: name, unit, a column for each source, and the members' band.
+
+    Nothing where the document has none.
+    """
+    sources, units = _mapping(quantities.get("beat")), _mapping(quantities.get("units"))
+    bands = _mapping(_mapping(quantities.get("members")).get("beat"))
+    names = list(dict.fromkeys(name for numbers in sources.values() for name in _mapping(numbers)))
+    if not names:
+        return []
+    rows = [["number", "unit", *sources, *(["members", "nine of ten within"] if bands else [])]]
+    for name in names:
+        values = [_number(_mapping(numbers).get(name)) for numbers in sources.values()]
+        band = [_number(_mapping(bands.get(name)).get(part)) for part in ("mean", "low", "high")]
+        known = [np.array([value]) for value in [*values, *band] if np.isfinite(value)]
+        if not known:
+            continue
+        factor, unit = (1e3, "ms") if units.get(name) == "s" else _scale(str(units.get(name, "")), known)
+        told = [_told(factor * value) for value in values]
+        if bands:
+            told += [_told(factor * band[0])]
+            told += [" to ".join(_told(factor * end) for end in band[1:]) if np.isfinite(band[1:]).all() else "-"]
+        rows.append([name.replace("_", " "), unit, *told])
+    return rows
+
+
+def _number(value: Any) -> float:
+    """A number, from whatever stands for one in a document; nan from anything else."""
+    try:
+        return float(value)
+    except (TypeError, ValueError):
+        return float("nan")
+
+
+def _told(value: float) -> str:
+    return f"{value:.3g}" if np.isfinite(value) else "-"
 
 
 def _mapping(value: Any) -> Mapping[str, Any]:

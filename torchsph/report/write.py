@@ -17,7 +17,7 @@ from torchsph.evaluation.frames import matching_frames
 from torchsph.evaluation.metrics import filled_velocity
 from torchsph.evaluation.scores import Scores
 
-from .curves import curves_of, measure_curves
+from .curves import beat_table, curves_of, measure_curves
 from .document import page
 from .pathlines import pathlines
 from .planes import View, cut_fields, drawn_channels, outlines, views
@@ -92,6 +92,7 @@ def write_report(
             curve.plain()
             for curve in [*curves_of(quantities or {}), *measure_curves(scores or {}, np.asarray(analysis.time))]
         ],
+        "beat": beat_table(quantities or {}),
         "table": scores_table(scores, seconds or {}) if scores else [],
         "checks": []
         if measured is None

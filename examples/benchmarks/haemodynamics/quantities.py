@@ -37,11 +37,13 @@ from torchsph.haemodynamics import (
     coverage,
     flow_components,
     seed_blood,
+    summary,
     time_derivative,
 )
 from torchsph.haemodynamics.flow_rate import peaks
 from torchsph.methods.members.kept import read_members
-from torchsph.methods.members.quantities import MemberQuantities
+
+Curves = dict[str, np.ndarray]
 
 CURVES = ("kinetic_energy", "energy_loss", "vorticity_rms", "force_axial", "flow_inlet", "flow_outlet")
 NUMBERS = ("stroke_volume", "filling_volume", "e_over_a", "energy_lost", "kinetic_energy_mean")
@@ -50,15 +52,16 @@ NUMBERS = ("stroke_volume", "filling_volume", "e_over_a", "energy_lost", "kineti
 class Fields:
     """Curves, pressure and vorticity of one recording's frames, du/dt by differences of them."""
 
-    def __init__(self, recording: geometry.Recording, *, own_sigma: bool = False) -> None:
-        domain = FlowDomain.from_recording(recording)
-        sampler = geometry.WallSampler(domain.motion, min(domain.grid.spacing))
+    def __init__(
+        self, recording: geometry.Recording, frames: list[FrameQuantities], *, own_sigma: bool = False
+    ) -> None:
+        domain = frames[0].domain
         velocity = np.nan_to_num(filled_velocity(recording)).astype(np.float64)
         made = []
         for n in range(recording.frames):
             rate = time_derivative(velocity, domain.mask, domain.time, n, events=domain.events)
             sigma = recording.sigma[n] if own_sigma and recording.sigma is not None else None
-            made.append(FrameQuantities(domain, n, sampler).of(velocity[n], rate, sigma=sigma))
+            made.append(frames[n].of(velocity[n], rate, sigma=sigma))
         self.time = recording.time
         self.curves = {name: np.array([one.curves[name] for one in made]) for name in UNITS}
         self.pressure = np.stack([one.pressure for one in made])
@@ -81,9 +84,16 @@ def field_error(found: np.ndarray, true: np.ndarray, mask: np.ndarray, *, centre
     return float(np.sqrt(errors / sizes))
 
 
-def drops(domain: FlowDomain, pressure: np.ndarray) -> np.ndarray:
+def frames_of(recording: geometry.Recording) -> list[FrameQuantities]:
+    """What depends on masks and walls alone, frame by frame."""
+    domain = FlowDomain.from_recording(recording)
+    sampler = geometry.WallSampler(domain.motion, min(domain.grid.spacing))
+    return [FrameQuantities(domain, n, sampler) for n in range(recording.frames)]
+
+
+def drops(frames: list[FrameQuantities], pressure: np.ndarray) -> np.ndarray:
     """Base less apex `(T,)`, Pa, of pressures `(T, *shape)`."""
-    return np.array([float(FrameQuantities(domain, n).pressure_difference(p)) for n, p in enumerate(pressure)])
+    return np.array([float(frame.pressure_difference(p)) for frame, p in zip(frames, pressure, strict=True)])
 
 
 def waves(times: np.ndarray, curve: np.ndarray, window: tuple[float, float]) -> list[float]:
@@ -116,26 +126,98 @@ def components(recording: geometry.Recording, velocity: np.ndarray, walls: Movin
     return [found.direct, found.retained, found.delayed, found.residual]
 
 
-def members_of(run: Path, analysis: geometry.Recording) -> tuple[MemberQuantities, dict[str, np.ndarray], float]:
-    """Quantities of all members, the fields of the pressure, and the seconds that the quantities took."""
-    quantities, pressures, seconds = MemberQuantities(analysis), [], 0.0
+def members_of(
+    run: Path, analysis: geometry.Recording, frames: list[FrameQuantities]
+) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """Curves of all members `(N, T)`, and fields of the pressure `(T, *shape)` by what they are made of."""
+    curves, pressures = [], []
     for frame in read_members(run / "members.h5", analysis):
-        began = time.process_time()
-        quantities.take(frame)
-        seconds += time.process_time() - began
-        of_frame = FrameQuantities(quantities.domain, frame.frame)
-        estimate = of_frame.of(frame.field, frame.rate).pressure
-        members = of_frame.of(frame.members, frame.member_rates).pressure
-        simulated = (
-            estimate if frame.pressure is None else np.where(np.isfinite(frame.pressure), frame.pressure, estimate)
-        )
-        pressures.append((estimate, members.mean(0), simulated))
-    names = ("forecast rates", "members", "simulator")
-    return (
-        quantities,
-        {name: np.stack(parts) for name, parts in zip(names, zip(*pressures, strict=True), strict=True)},
-        seconds,
-    )
+        velocity = np.concatenate([frame.field[None], frame.members])
+        made = frames[frame.frame].of(velocity, np.concatenate([frame.rate[None], frame.member_rates]))
+        curves.append({name: made.curves[name][1:] for name in UNITS})
+        own = made.pressure[0]
+        if frame.pressure is not None:
+            own = np.where(np.isfinite(frame.pressure), frame.pressure, own)
+        pressures.append((made.pressure[0], made.pressure[1:].mean(0), own))
+    fields = zip(("forecast rates", "members", "simulator"), zip(*pressures, strict=True), strict=True)
+    stacked = {name: np.stack([one[name] for one in curves], axis=1) for name in UNITS}
+    return stacked, {name: np.stack(parts) for name, parts in fields}
+
+
+class Comparison:
+    """A truth, a measurement of it, and what a run made of that."""
+
+    def __init__(self, truth: Path, measured: Path, run: Path) -> None:
+        self.run, self.every, self.measured = run, geometry.read_recording(truth), geometry.read_recording(measured)
+        self.spline = geometry.read_recording(run / "spline.h5")
+        self.ensemble = geometry.read_recording(run / "ensemble.h5")
+        self.chosen = matching_frames(self.measured.time, self.every.time, "the truth")
+        self.true = self.every.select(self.chosen)
+
+    def read_out(self) -> dict[str, Any]:
+        """Curves, fields, pressure differences, waves, numbers and coverage."""
+        frames, all_frames = frames_of(self.true), frames_of(self.every)
+        whole, mask = Fields(self.every, all_frames), np.asarray(self.true.mask, bool)
+        right = {name: curve[self.chosen] for name, curve in whole.curves.items()}
+        pressure = np.asarray(self.true.pressure, np.float64)
+        right["pressure_difference"] = drops(frames, pressure)
+        named = {"formula": self.true, "raw": self.measured, "spline": self.spline, "ensemble": self.ensemble}
+        sources = {name: Fields(one, frames) for name, one in named.items()}
+        fields = {name: one.pressure for name, one in sources.items()}
+        curves = {name: one.curves for name, one in sources.items()}
+        curves["with variance"] = Fields(self.ensemble, frames, own_sigma=True).curves
+        members, more = members_of(self.run, self.ensemble, frames)
+        bands, fields = {name: summary(values) for name, values in members.items()}, fields | more
+        curves["members"] = {name: band.mean for name, band in bands.items()}
+        spins = {name: field_error(one.vorticity, whole.vorticity[self.chosen], mask) for name, one in sources.items()}
+        return {
+            "curves": {c: {name: off(each[c], right[c]) for name, each in curves.items()} for c in CURVES},
+            "fields": {
+                "vorticity": spins,
+                "pressure": {name: field_error(one, pressure, mask, centred=True) for name, one in fields.items()},
+            },
+            **self._differences(frames, all_frames, fields, right["pressure_difference"]),
+            "numbers": self._numbers(whole.curves, curves),
+            "coverage": {name: coverage(bands[name], right[name]) for name in UNITS if name != "volume"},
+        }
+
+    def _differences(
+        self,
+        frames: list[FrameQuantities],
+        all_frames: list[FrameQuantities],
+        fields: dict[str, np.ndarray],
+        right: np.ndarray,
+    ) -> dict[str, Any]:
+        """Base less apex: error and correlation of the curve, and how far the peaks of E and A are off."""
+        domain, differences, apart = frames[0].domain, {}, {}
+        fills = next((row[1], row[2]) for row in domain.intervals if int(row[0]) == domain.inlet)
+        reference = waves(self.every.time, drops(all_frames, np.asarray(self.every.pressure)), fills)
+        for name, field in fields.items():
+            curve = drops(frames, field)
+            correlation = float(np.corrcoef(curve, right)[0, 1])
+            differences[name] = {"error": off(curve, right), "correlation": correlation}
+            late = 1e3 * (np.array(waves(self.true.time, curve, fills)) - reference)
+            apart[name] = {"E [ms]": float(late[0]), "A [ms]": float(late[1])}
+        return {"pressure difference": differences, "waves": apart}
+
+    def _numbers(self, exact_curves: Curves, curves: dict[str, Curves]) -> dict[str, Any]:
+        """Numbers of the beat, relative to the truth's, and the stroke volume to the walls'."""
+        exact, found = beat_numbers(self.every.time, exact_curves), {}
+        for name, each in curves.items():
+            numbers = beat_numbers(self.true.time, each)
+            found[name] = {one: float(numbers[one] / exact[one] - 1) for one in NUMBERS}
+            found[name]["over the walls'"] = float(numbers["stroke_volume"] / exact["stroke_volume_wall"] - 1)
+        return found
+
+    def components(self, count: int) -> dict[str, Any]:
+        """Shares of the four flow components by `count` tracers, and the seconds that the truth's took."""
+        walls, began = MovingWalls.from_recording(self.every), time.process_time()
+        shares = {"truth, every frame": components(self.every, self.every.velocity, walls, count)}
+        seconds = time.process_time() - began
+        named = {"formula": self.true, "raw": self.measured, "spline": self.spline, "ensemble": self.ensemble}
+        for name, one in named.items():
+            shares[name] = components(self.true, np.nan_to_num(filled_velocity(one)), walls, count)
+        return {"flow components": shares, "seconds of flow components": seconds}
 
 
 def main() -> None:
@@ -145,66 +227,17 @@ def main() -> None:
     parser.add_argument("measured", type=Path)
     parser.add_argument("run", type=Path, help="with spline.h5, ensemble.h5 and members.h5")
     parser.add_argument("--tracers", type=int, default=20_000)
-    parser.add_argument("--json", type=Path)
+    parser.add_argument("--only", choices=("fields", "components"), help="one half, beside the other in the JSON file")
+    parser.add_argument("--json", type=Path, help="results file, read and updated")
     options = parser.parse_args()
     torch.set_num_threads(1)
-    every = geometry.read_recording(options.truth)
-    measured, spline = geometry.read_recording(options.measured), geometry.read_recording(options.run / "spline.h5")
-    ensemble = geometry.read_recording(options.run / "ensemble.h5")
-    chosen = matching_frames(measured.time, every.time, "the truth")
-    true = every.select(chosen)
-    mask, domain = np.asarray(true.mask, bool), FlowDomain.from_recording(true)
-    whole = Fields(every)
-    right = {name: curve[chosen] for name, curve in whole.curves.items()}
-    pressure = np.asarray(true.pressure, np.float64)
-    right["pressure_difference"] = drops(domain, pressure)
-    sources = {
-        "formula": Fields(true),
-        "raw": Fields(measured),
-        "spline": Fields(spline),
-        "ensemble": Fields(ensemble),
-        "with variance": Fields(ensemble, own_sigma=True),
-    }
-    quantities, pressures, seconds = members_of(options.run, ensemble)
-    found = quantities.found()
-    bands = found.bands()
-    curves = {name: one.curves for name, one in sources.items()}
-    curves["members"] = {name: bands[name].mean for name in UNITS}
-    result: dict[str, Any] = {"curves": {}, "fields": {}, "pressure difference": {}, "numbers": {}, "waves": {}}
-    for name in CURVES:
-        result["curves"][name] = {source: off(each[name], right[name]) for source, each in curves.items()}
-    result["fields"]["vorticity"] = {
-        source: field_error(one.vorticity, whole.vorticity[chosen], mask) for source, one in sources.items()
-    }
-    fields = {name: one.pressure for name, one in sources.items() if name != "with variance"} | pressures
-    result["fields"]["pressure"] = {s: field_error(p, pressure, mask, centred=True) for s, p in fields.items()}
-    fills = next((row[1], row[2]) for row in domain.intervals if int(row[0]) == domain.inlet)
-    reference = waves(every.time, drops(FlowDomain.from_recording(every), every.pressure), fills)
-    lines = {source: drops(domain, field) for source, field in fields.items()}
-    for source, curve in lines.items():
-        correlation = float(np.corrcoef(curve, right["pressure_difference"])[0, 1])
-        result["pressure difference"][source] = {
-            "error": off(curve, right["pressure_difference"]),
-            "correlation": correlation,
-        }
-        apart = np.array(waves(true.time, curve, fills)) - reference
-        result["waves"][source] = {"E [ms]": 1e3 * float(apart[0]), "A [ms]": 1e3 * float(apart[1])}
-    exact = beat_numbers(every.time, whole.curves)
-    from_walls = float(exact["stroke_volume_wall"])
-    for source, each in curves.items():
-        numbers = beat_numbers(true.time, each)
-        result["numbers"][source] = {name: float(numbers[name] / exact[name] - 1) for name in NUMBERS}
-        result["numbers"][source]["stroke volume over the walls'"] = float(numbers["stroke_volume"] / from_walls - 1)
-    inside = {name: coverage(bands[name], right[name]) for name in UNITS if name != "volume"}
-    result["coverage"] = inside
-    walls = MovingWalls.from_recording(every)
-    began = time.process_time()
-    shares = {"truth, every frame": components(every, every.velocity, walls, options.tracers)}
-    result["seconds of flow components"] = time.process_time() - began
-    for source, one in (("formula", true), ("raw", measured), ("spline", spline), ("ensemble", ensemble)):
-        shares[source] = components(true, np.nan_to_num(filled_velocity(one)), walls, options.tracers)
-    result["flow components"] = shares
-    result["seconds of members' quantities"] = seconds
+    given = Comparison(options.truth, options.measured, options.run)
+    there = options.json is not None and options.json.exists()
+    result = json.loads(options.json.read_text(encoding="utf-8")) if there else {}
+    if options.only != "components":
+        result |= given.read_out()
+    if options.only != "fields":
+        result |= given.components(options.tracers)
     show(result)
     if options.json is not None:
         options.json.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cached_property
 from pathlib import Path
 
 import h5py
@@ -30,18 +29,17 @@ class Reversed:
 
 
 class Variable:
-    """A variable of a version 5 file, read when it is first asked for."""
+    """A variable of a version 5 file, read when it is asked for; the file's last one alone is kept."""
 
-    def __init__(self, load: Callable[[], np.ndarray], shape: tuple[int, ...], kind: str) -> None:
-        self._load, self.shape = load, shape
+    def __init__(self, load: Callable[[], np.ndarray], shape: tuple[int, ...], kind: str, kept: dict) -> None:
+        self._load, self.shape, self._kept = load, shape, kept
         self.dtype = np.dtype({"double": "f8", "single": "f4", "logical": "u1"}.get(kind, kind))
 
-    @cached_property
-    def _values(self) -> np.ndarray:
-        return self._load()
-
     def __getitem__(self, index: tuple) -> np.ndarray:
-        return self._values[index]
+        if self not in self._kept:
+            self._kept.clear()
+            self._kept[self] = self._load()
+        return self._kept[self][index]
 
 
 def open_matlab(path: Path) -> Source:
@@ -61,8 +59,9 @@ def open_matlab(path: Path) -> Source:
     def loader(name: str) -> Callable[[], np.ndarray]:
         return lambda: np.asarray(loadmat(str(path), variable_names=[name])[name])
 
-    found = {name: Variable(loader(name), shape, kind) for name, shape, kind in listed if kind in NUMBERS}
-    return Source(str(path), found, axes=_matlab_axes(found))
+    kept: dict = {}
+    found = {name: Variable(loader(name), shape, kind, kept) for name, shape, kind in listed if kind in NUMBERS}
+    return Source(str(path), found, axes=_matlab_axes(found), close=kept.clear)
 
 
 def _matlab_axes(arrays: dict) -> dict[str, str]:

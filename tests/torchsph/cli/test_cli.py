@@ -93,6 +93,7 @@ def assimilated(files, tmp_path_factory) -> tuple[Path, subprocess.CompletedProc
         *QUICK,
         "--members",
         "3",
+        "--keep-members",
         "--out",
         "out",
         cwd=folder,
@@ -113,6 +114,9 @@ def test_assimilate_writes_what_it_promises(assimilated, files):
         "filter.png",
         "metrics.json",
         "config.toml",
+        "quantities.json",
+        "quantities.csv",
+        "members.h5",
     }
     measured = geometry.read_recording(files["measured"])
     for name in (*analyses, "analysis.h5"):
@@ -121,7 +125,53 @@ def test_assimilate_writes_what_it_promises(assimilated, files):
         np.testing.assert_array_equal(analysis.time, measured.time)
         np.testing.assert_array_equal(analysis.mask, measured.mask)
     assert (folder / "analysis.h5").read_bytes() == (folder / f"{pipeline.DEFAULT_METHOD}.h5").read_bytes()
-    assert list(rows(done.stdout)) == ["method", "raw", *pipeline.METHODS]
+    assert list(rows(done.stdout))[: 2 + len(pipeline.METHODS)] == ["method", "raw", *pipeline.METHODS]
+
+
+def test_assimilate_reads_quantities_out_of_every_member(assimilated, files, tmp_path):
+    folder, done = assimilated
+    document = json.loads((folder / "quantities.json").read_text())
+    bands = document["members"]["curves"]["pressure_difference"]
+    assert all(low < mean < high for low, mean, high in zip(*(bands[k] for k in ("low", "mean", "high")), strict=True))
+    assert set(document["curves"]) == {"analysis", "truth"} and "kinetic_energy" in document["members"]["coverage"]
+    analysis = geometry.read_recording(folder / "analysis.h5")
+    inside = np.asarray(analysis.mask, bool)
+    assert np.isfinite(analysis.pressure[inside]).all() and (analysis.pressure_sigma[inside] > 0).mean() > 0.9
+    assert "pressure_difference_highest" in rows(done.stdout)
+    again = [
+        "quantify",
+        str(folder / "analysis.h5"),
+        "--members",
+        str(folder / "members.h5"),
+        "--truth",
+        files["truth"],
+    ]
+    assert cli.main([*again, "--out", str(tmp_path)]) == 0
+    kept = json.loads((tmp_path / "quantities.json").read_text())["members"]["curves"]["kinetic_energy"]["mean"]
+    np.testing.assert_allclose(kept, document["members"]["curves"]["kinetic_energy"]["mean"], rtol=1e-3)
+    assert "members kinetic_energy low [J]" in (folder / "quantities.csv").read_text().splitlines()[0]
+
+
+@pytest.mark.slow  # half a minute
+def test_quantities_of_splines_have_bands_where_they_are_asked_for(files, tmp_path):
+    arguments = ["assimilate", files["measured"], "--method", "spline", "--members", "4", "--quantities"]
+    assert cli.main([*arguments, "--out", str(tmp_path)]) == 0
+    document = json.loads((tmp_path / "quantities.json").read_text())
+    assert min(document["members"]["curves"]["kinetic_energy"]["deviation"]) > 0
+    assert geometry.read_recording(tmp_path / "analysis.h5").pressure_sigma is not None
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        (["--method", "spline", "--keep-members"], "--keep-members: only the ensemble has members"),
+        (["--keep-members", "--lag", "2"], "with --lag they change"),
+        (["--quantities", "--no-quantities"], "cannot be together"),
+    ],
+)
+def test_options_of_quantities_that_cannot_be(options, told, files, tmp_path, capsys):
+    assert cli.main(["assimilate", files["measured"], *options, "--out", str(tmp_path / "out")]) == 2
+    assert told in capsys.readouterr().err
 
 
 def test_assimilate_reports_the_errors_of_the_files_it_wrote(assimilated, files):

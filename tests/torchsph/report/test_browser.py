@@ -78,11 +78,13 @@ def opened(tmp_path, browser, box_recording) -> Iterator[Callable[..., Page]]:
         pressure=np.linspace(-50, 80, recording.mask.size, dtype=np.float32).reshape(recording.mask.shape),
     )
     band = [1.0, 2.0, 3.0, 2.0, 1.0]
-    curves = {"mean": band, "p05": [0.5 * x for x in band], "p95": [1.5 * x for x in band]}
+    members = {"mean": band, "low": [0.5 * x for x in band], "high": [1.5 * x for x in band]}
     quantities = {
         "time": recording.time.tolist(),
         "units": {"energy_loss": "W"},
-        "curves": {"analysis": {"energy_loss": curves}},
+        "curves": {"analysis": {"energy_loss": band}},
+        "members": {"curves": {"energy_loss": members}},
+        "beat": {"analysis": {"energy_lost": 2.0}},
     }
     write_report(
         tmp_path / "page.html",

@@ -7,7 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from torchsph.cli.quantity_tables import QuantityTables
+from torchsph.haemodynamics import beat_numbers, summary
 from torchsph.report import curves_of, measurement_checks
+from torchsph.report.curves import beat_table
 from torchsph.report.pathlines import pathlines
 
 TIMES = tuple(0.01 * n for n in range(6))
@@ -29,25 +32,48 @@ def test_curves_with_and_without_bands():
         "time": [0.0, 0.01],
         "units": {"kinetic_energy": "J", "flow_inlet": "m3/s", "volume": "m3"},
         "curves": {
-            "analysis": {
-                "volume": [5e-6, 4e-6],
+            "analysis": {"volume": [5e-6, 4e-6], "kinetic_energy": [0.9e-4, 1.8e-4]},
+            "truth": {"kinetic_energy": [1.1e-4, 2.1e-4]},
+        },
+        "members": {
+            "curves": {
                 "kinetic_energy": {
                     "mean": [1e-4, 2e-4],
-                    "sd": [1e-5, 1e-5],
-                    "p05": [8e-5, None],
-                    "p95": [1.2e-4, None],
+                    "deviation": [0, 0],
+                    "low": [8e-5, None],
+                    "high": [1.2e-4, None],
                 },
                 "flow_inlet": {"time": [0.0, 0.005, 0.01], "value": [1e-5, 2e-5, 3e-5]},
-            },
-            "truth": {"kinetic_energy": [1.1e-4, 2.1e-4]},
+            }
         },
     }
     energy, inlet, volume = (curve.plain() for curve in curves_of(document))
     assert [one["name"] for one in (energy, inlet, volume)] == ["Kinetic energy", "Flow through the inlet", "Volume"]
     assert [one["unit"] for one in (energy, inlet, volume)] == ["µJ", "ml/s", "ml"]
-    analysis, truth = energy["lines"]
-    assert analysis["values"] == [100.0, 200.0] and analysis["low"] == [80.0, None] and truth["low"] is None
+    assert [line["label"] for line in energy["lines"]] == ["analysis", "members", "truth"]
+    analysis, members, truth = energy["lines"]
+    assert members["values"] == [100.0, 200.0] and members["low"] == [80.0, None]
+    assert analysis["low"] is None and truth["values"] == [110.0, 210.0]
     assert inlet["lines"][0]["time"] == [0.0, 0.005, 0.01] and inlet["lines"][0]["values"] == [10.0, 20.0, 30.0]
+
+
+def test_what_quantify_writes_is_understood(box_recording):
+    """Curves, bands and numbers of the beat, from the document as the command line makes it."""
+    flow = box_recording(uniform, times=TIMES)
+    curves = QuantityTables.of(flow, None, flow)
+    members = {name: np.stack([row, 1.2 * row, 0.8 * row]) for name, row in curves.curves["analysis"].items()}
+    bands = {name: summary(rows) for name, rows in members.items()}
+    beat = {name: summary(rows) for name, rows in beat_numbers(flow.time, members).items()}
+    document = QuantityTables(flow.time, curves.curves, bands, beat).document({})
+    energy = next(one for one in curves_of(document) if one.name == "kinetic_energy")
+    assert [line.label for line in energy.lines] == ["analysis", "members", "truth"]
+    np.testing.assert_array_equal(energy.lines[1].low, bands["kinetic_energy"].low)
+    heading, *rows = beat_table(document)
+    assert heading == ["number", "unit", "analysis", "truth", "members", "nine of ten within"]
+    peak = next(row for row in rows if row[0] == "kinetic energy peak")
+    exact = 0.5 * 1060 * 0.1**2 * 1e-6  # J, of a millilitre at 0.1 m/s
+    assert float(peak[2]) == pytest.approx(1e6 * exact, rel=5e-3) and peak[1] == "µJ" and peak[3] == peak[2]
+    assert " to " in peak[5] and not [row for row in rows if set(row[2:]) == {"-"}]
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -63,12 +64,20 @@ class MemberQuantities:
 
     Args:
         recording: whose masks, walls, valves and fluid they are.
+        strict: raise what goes wrong with a frame; else warn of it and read nothing more (``fault``): a frame without
+            blood, or walls without an opening, must not cost a run that was not made for its quantities.
+
+    Attributes:
+        fault: what went wrong, or None.
 
     Raises:
         ValueError: it is a plane recording.
     """
 
-    def __init__(self, recording: geometry.Recording) -> None:
+    fault: str | None
+
+    def __init__(self, recording: geometry.Recording, *, strict: bool = True) -> None:
+        self.strict, self.fault = strict, None
         self.domain = FlowDomain.from_recording(recording)
         self._sampler = geometry.WallSampler(self.domain.motion, min(self.domain.grid.spacing))
         self._curves: list[Array] = []
@@ -77,6 +86,18 @@ class MemberQuantities:
 
     def take(self, frame: MemberFrame) -> None:
         """Compute the quantities of one frame; a frame that comes again takes the place of its first."""
+        if self.fault is not None:
+            return
+        try:
+            self._read(frame)
+        except (ValueError, RuntimeError) as fault:
+            if self.strict:
+                raise
+            self.fault = str(fault)
+            text = f"no quantities are read out: at {self.domain.time[frame.frame]:g} s {fault}"
+            warnings.warn(text, RuntimeWarning, stacklevel=2)
+
+    def _read(self, frame: MemberFrame) -> None:
         for kept in (self._curves, self._pressure, self._sigma):
             del kept[frame.frame :]
         if len(self._curves) != frame.frame:
@@ -111,12 +132,12 @@ class MemberQuantities:
     def state(self) -> dict[str, Any]:
         """What a checkpoint has to hold."""
         kept = {"curves": self._curves, "pressure": self._pressure, "sigma": self._sigma}
-        return {
-            name: [torch.from_numpy(np.ascontiguousarray(each)) for each in values] for name, values in kept.items()
-        }
+        tensors = {name: [torch.from_numpy(np.array(each)) for each in values] for name, values in kept.items()}
+        return {**tensors, "fault": self.fault}
 
     def restore(self, state: dict[str, Any]) -> None:
         """Go on from what ``state`` gave."""
+        self.fault = state["fault"]
         self._curves, self._pressure, self._sigma = (
             [np.asarray(each) for each in state[name]] for name in ("curves", "pressure", "sigma")
         )

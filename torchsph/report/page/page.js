@@ -94,8 +94,10 @@ function begin() {
   byId("curves-hint").textContent = `${banded ? "Bands hold nine of ten of the members. " : ""}Shaded: open orifices, blue the first, red the second. A click goes to that time.`;
   byId("quality-part").hidden = !DATA.checks.length;
   showChecks(byId("quality"), DATA.checks);
-  byId("methods-part").hidden = !DATA.table.length;
-  if (DATA.table.length) byId("methods").append(tableOf(DATA.table[0], DATA.table.slice(1)));
+  for (const [name, rows] of [["methods", DATA.table], ["beat", DATA.beat]]) {
+    byId(`${name}-part`).hidden = !rows.length;
+    if (rows.length) byId(name).append(tableOf(rows[0], rows.slice(1)));
+  }
   DATA.notes.forEach((text) => byId("notes").append(made("p", text)));
   showAccount(byId("account"), DATA.account);
   byId("play").addEventListener("click", () => play(!state.playing));

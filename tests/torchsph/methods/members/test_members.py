@@ -160,6 +160,21 @@ def test_a_restart_goes_on_with_members(given, followed, tmp_path):
         given.run(observers=observers(), checkpoints=saved, resume=True)
 
 
+def test_a_frame_that_cannot_be_read_costs_the_quantities_alone(followed):
+    recording, frames, _, _ = followed
+    closed = replace(recording, wall=replace(recording.wall, region=np.zeros_like(recording.wall.region)))
+    with pytest.raises(ValueError, match="no orifice"):
+        MemberQuantities(closed).take(frames[0])
+    tolerant = MemberQuantities(closed, strict=False)
+    with pytest.warns(RuntimeWarning, match="no quantities are read out: .* no orifice"):
+        tolerant.take(frames[0])
+    tolerant.take(frames[1])
+    assert "no orifice" in tolerant.fault
+    again = MemberQuantities(closed)
+    again.restore(tolerant.state())
+    assert again.fault == tolerant.fault
+
+
 def test_a_lag_is_refused(given):
     with pytest.raises(ValueError, match="without a lag alone"):
         given.run(observers=[Kept()], options=EnsembleOptions(lag=2))

@@ -176,3 +176,31 @@ def test_backflow_turns_within_an_interval():
     assert mean_speed(run) == pytest.approx(-3e-5 / (math.pi * RADIUS**2), rel=0.15)
     assert float(run.record.outside.sum()) == 0
     assert run.record.filling.item() == pytest.approx(1.0, abs=0.03)
+
+
+def section_fluxes(run, grid, inside):
+    """Flux (m3/s) through every section z of a grid that lies across the tube; its area is the exact one."""
+    speed = run.fetch(grid, inside).value[0, 2].double() * inside
+    return speed.sum((1, 2)) * math.pi * RADIUS**2 / inside[0].sum()
+
+
+@pytest.mark.slow
+def test_what_comes_in_goes_out_through_every_section():
+    """Mean over 100 ms: sections agree within half a percent (measured .49 % between the extremes, .36 % of the ends).
+
+    At one moment two sections differ by up to 1.6 %: that is the sampling of a section by its particles.
+    """
+    run = Simulator(tube_scene(spacing=1.5e-3), preset("default")).start(0.0, seed=0)
+    run.impose(*parabola())
+    before = mean_speed(run)
+    across = 0.0105
+    grid = geometry.Grid.covering((-across, -across, 2e-3), (across, across, LENGTH - 2e-3), 5e-4)
+    inside = (grid.nodes()[:, :2].square().sum(1) < RADIUS**2).reshape(grid.shape)
+    total = torch.zeros(grid.shape[0], dtype=torch.float64)
+    for moment in range(1, 21):
+        run.advance(5e-3 * moment)
+        total += section_fluxes(run, grid, inside) / 20
+    assert float(total[0] / total[-1]) == pytest.approx(1.0, abs=5e-3)
+    assert float(total.max() / total.min()) == pytest.approx(1.0, abs=5e-3)
+    assert float(total.mean()) == pytest.approx(TRUE_FLUX, rel=0.02)
+    assert mean_speed(run) == pytest.approx(before, rel=0.02)
