@@ -142,7 +142,7 @@ def run_methods(
             options=EnsembleOptions(lag=lag, minimum_members=minimum_members),
             truth=truth,
             checkpoints=None if checkpoints is None else Path(checkpoints),
-            resume=resume,
+            resume=_read_once(resume, checkpoints),
             seed=seed,
             quantities="ensemble" in quantities,
             keep_members=keep_members,
@@ -164,6 +164,13 @@ def run_methods(
         done, curves = ensemble.run(watcher, progress)
         results["ensemble"] = timer.result(with_pressure(done.recording, curves), done.info | mended, curves)
     return _collected(results)
+
+
+def _read_once(resume: bool | Saved, checkpoints: str | Path | None) -> bool | Saved:
+    """What to go on from, read by the process that leads."""
+    if resume is True and checkpoints is not None and is_lead():
+        return Saved.read(Path(checkpoints)) or True
+    return resume
 
 
 def predicted_memory(
