@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from .integers import region_number
 from .overlap import refuse_overlaps, united
 from .readers.obj import read_obj
 from .readers.ply import read_ply
@@ -102,6 +103,9 @@ def labelled(
     Raises:
         SurfaceError: no face is meant.
     """
+    region = region_number("labelled: region", region)
+    if np.shape(centre) != (surface.dimension,):
+        raise SurfaceError(f"labelled: centre must be {surface.dimension} numbers (m), not {centre!r:.80}")
     away = np.linalg.norm(surface.centroids - np.asarray(centre, np.float64), axis=1)
     chosen = away < radius
     if normal is not None:

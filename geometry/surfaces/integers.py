@@ -53,3 +53,14 @@ def refuse_changed(array: np.ndarray, kind: type) -> None:
         raise ValueError(f"must hold {meaning}, not {array.min()} to {array.max()}")
     if array.dtype.kind == "f" and (array != np.rint(array)).any():
         raise ValueError("must hold integers" if kind is not np.bool_ else "must hold 0 and 1 only")
+
+
+def region_number(name: str, value: float) -> int:
+    """A number of a region, from 0 to 255.
+
+    Raises:
+        ValueError: it is none.
+    """
+    if not isinstance(value, int | float | np.number) or value not in range(256):
+        raise ValueError(f"{name} must be a whole number from 0 to 255, not {value!r:.80}")
+    return int(value)

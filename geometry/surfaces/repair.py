@@ -10,6 +10,7 @@ from scipy.sparse.csgraph import breadth_first_order, connected_components
 from scipy.spatial import cKDTree
 
 from .holes import least_area_triangles, star_shaped
+from .integers import region_number
 from .surface import Surface, SurfaceError, ridges_of
 
 
@@ -95,8 +96,9 @@ def _closed(surface: Surface, region: int | Sequence[int]) -> Surface:
     """Every hole closed: in a plane by an edge between the ends, else by a fan or along its rim."""
     if surface.open_ridges == 0:
         return surface
-    labels = [] if isinstance(region, int) else list(region)
-    rest = region if isinstance(region, int) else 0
+    single = isinstance(region, int | float | np.number)
+    labels = [] if single else [region_number("hole_region", one) for one in region]
+    rest = region_number("hole_region", region) if single else 0
     if surface.dimension == 2:
         starts = np.setdiff1d(surface.faces[:, 0], surface.faces[:, 1])
         ends = np.setdiff1d(surface.faces[:, 1], surface.faces[:, 0])

@@ -11,6 +11,7 @@ from torch import Tensor
 import geometry
 from torchsph.pairs.moving_least_squares import Fetched
 
+from .schemes.option_fields import check_numbers
 from .simulator import Simulation, Simulator
 from .transfer.checks import check_grid
 
@@ -31,6 +32,7 @@ class Transfer:
     projections: int = 2
 
     def __post_init__(self) -> None:
+        check_numbers(self)
         if self.fade is not None and not self.fade > 0:
             raise ValueError(f"Transfer.fade must be positive (s) or None, got {self.fade}")
         if self.projections < 0:

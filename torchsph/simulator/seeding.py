@@ -12,6 +12,7 @@ from torchsph.pairs.interface import Backend, RateTerms, Support
 from torchsph.pairs.smoothing_kernels import kernel
 
 from .domain import Domain
+from .schemes.option_fields import check_numbers
 from .schemes.wall_models import PotentialWall
 from .schemes.weakly_compressible import WeaklyCompressible
 from .state.neighbour_list import PairSearch
@@ -50,6 +51,7 @@ class Seeding:
     jitter: float = 0.02
 
     def __post_init__(self) -> None:
+        check_numbers(self)
         if self.kind not in ("boltzmann", "quiet"):
             raise ValueError(f"Seeding.kind must be 'boltzmann' or 'quiet', got '{self.kind}'")
         if not self.temperature > 0 or min(self.relaxations, self.packings) < 0 or not 0 <= self.jitter < 0.5:

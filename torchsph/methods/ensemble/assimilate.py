@@ -133,7 +133,9 @@ def assimilate(
     filter = default_filter(first.recording, options) if filter is None else filter
     key = ensemble_key(prepared, model, coarse, filter, options, members=members, seed=seed, truth=truth)
     path = None if checkpoints is None else Path(checkpoints)
-    saved = Saved.read(path) if resume is True and path is not None else resume or None
+    saved = resume if isinstance(resume, Saved) else None
+    if resume is True and path is not None:
+        saved = Saved.read(path)
     if saved is not None:
         saved.refuse_foreign(key)  # before the splines and error models that the cycle begins with
     cycle = Cycle(

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from torchsph.assimilation import Parameter
 from torchsph.simulator.grid_forecast import Transfer
+from torchsph.simulator.schemes.option_fields import check_numbers
 
 INCREMENTS = ("spline", "ensemble")
 
@@ -29,6 +30,7 @@ class Estimated:
     spread: float
 
     def __post_init__(self) -> None:
+        check_numbers(self)
         if not self.spread > 0:
             raise ValueError(f"Estimated.spread of {self.parameter.name} must be positive, got {self.spread}")
 
@@ -84,6 +86,7 @@ class EnsembleOptions:
     estimated: tuple[Estimated, ...] = ()
 
     def __post_init__(self) -> None:
+        check_numbers(self)
         for name in ("length", "localisation", "choose_every", "batch", "lag", "minimum_members"):
             if getattr(self, name) is not None and not getattr(self, name) > 0:
                 raise ValueError(f"EnsembleOptions.{name} must be positive, got {getattr(self, name)}")

@@ -7,6 +7,7 @@ from typing import ClassVar
 
 from torchsph.pairs.smoothing_kernels import kernel
 
+from .option_fields import check_numbers
 from .population_control import PopulationControl
 from .scheme import Scheme
 from .valve_models import Reservoir, ValveOptions
@@ -64,6 +65,7 @@ class Projection(Scheme):
     population: PopulationControl | None = None
 
     def __post_init__(self) -> None:
+        check_numbers(self)
         kernel(self.kernel)
         for name in ("smoothing_ratio", "courant", "tolerance"):
             if not getattr(self, name) > 0:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar, Protocol
 
+from .option_fields import check_numbers
+
 
 class ValveOptions(Protocol):
     """What the engine asks of the options of any valve model; ``valves.registry`` knows which model is theirs."""
@@ -26,6 +28,7 @@ class PressureSource:
     needs_compressible: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
+        check_numbers(self)
         if not self.core > 0:
             raise ValueError(f"PressureSource.core must be positive, got {self.core}")
 
@@ -49,6 +52,7 @@ class Reservoir:
     needs_compressible: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
+        check_numbers(self)
         if self.profile not in ("field", "flat"):
             raise ValueError(f"Reservoir.profile must be 'field' or 'flat', got '{self.profile}'")
         if self.run_out != 0 and not self.run_out > 1:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar, Protocol
 
+from .option_fields import check_numbers
+
 
 class WallModel(Protocol):
     """What the engine asks of the options of any wall model; lengths in particle spacings."""
@@ -55,6 +57,7 @@ class PotentialWall:
     needs_compressible: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
+        check_numbers(self)
         if not self.stiffness > 0 or not self.reach > 0:
             raise ValueError(f"PotentialWall needs positive stiffness and reach, got {self.stiffness}, {self.reach}")
         if self.relaxation is not None and not self.relaxation > 0:
@@ -86,5 +89,6 @@ class CompleteKernelWall:
     needs_compressible: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
+        check_numbers(self)
         if not 0 <= self.gap < 0.5:
             raise ValueError(f"CompleteKernelWall.gap must lie in [0, 0.5), got {self.gap}")

@@ -8,6 +8,7 @@ from typing import ClassVar
 from torchsph.pairs.interface import CONTINUITY_FORMS, PRESSURE_FORMS
 from torchsph.pairs.smoothing_kernels import kernel
 
+from .option_fields import check_numbers
 from .parts import XSPH, GammaRamp, Rollback
 from .population_control import PopulationControl
 from .scheme import Scheme
@@ -97,6 +98,7 @@ class WeaklyCompressible(Scheme):
     gamma_ramp: GammaRamp | None = None
 
     def __post_init__(self) -> None:
+        check_numbers(self)
         kernel(self.kernel)
         for name in ("smoothing_ratio", "sound_speed", "gamma", "courant"):
             if not getattr(self, name) > 0:

@@ -20,8 +20,8 @@ from .openings import Openings
 Work = Callable[[Particles, Clock], tuple[Particles, bool]]
 
 
-def groups(openings: Openings, clock: Clock, members: int, stepping: Tensor | None = None) -> list[Tensor | None]:
-    """Members (members,) bool that see the same planes, those with the earliest first; None stands for all.
+def groups(openings: Openings, clock: Clock, members: int, stepping: Tensor | None = None) -> list[Tensor] | None:
+    """Members (members,) bool that see the same planes, those with the earliest first; None: all see the same.
 
     Args:
         openings: of the scene's valves.
@@ -32,9 +32,10 @@ def groups(openings: Openings, clock: Clock, members: int, stepping: Tensor | No
     counted = stepping is None or bool(stepping.all())
     place = openings.place_number(clock.times)
     if place.ndim == 0 or members == 1 or bool((place == place[0]).all()):
-        return [None] if counted else [stepping]
-    found = torch.unique(place if counted else place[stepping])
-    return [(place == number) if counted else (place == number) & stepping for number in found]
+        return None if counted or stepping is None else [stepping]
+    if counted or stepping is None:
+        return [place == number for number in torch.unique(place)]
+    return [(place == number) & stepping for number in torch.unique(place[stepping])]
 
 
 def apart(
@@ -50,7 +51,7 @@ def apart(
         stepping: (members,) bool, those to whom it is done; None: all.
     """
     found = groups(openings, clock, particles.members, stepping)
-    if found == [None]:
+    if found is None:
         return work(particles, clock)
     rows, parts, renumbered = [], [], False
     left = torch.ones(particles.count, dtype=torch.bool, device=particles.member.device)
@@ -68,3 +69,24 @@ def apart(
         together = together.joined(part)
     # where none came or went every particle goes back to its own row
     return (together if renumbered else together.select(torch.argsort(torch.cat(rows)))), renumbered
+
+
+def measured_apart(
+    openings: Openings, particles: Particles, clock: Clock, measure: Callable[[Particles, Clock], Tensor]
+) -> Tensor:
+    """What is measured of every member, (members,), from the particles of its group.
+
+    Args:
+        openings: of the scene's valves.
+        particles: of all members.
+        clock: their present times.
+        measure: gives (members,) of particles of members that see the same planes.
+    """
+    found = groups(openings, clock, particles.members)
+    if found is None:
+        return measure(particles, clock)
+    parts = [measure(particles.select(group[particles.member]), clock.seen_by(group)) for group in found]
+    together = parts[0]
+    for group, part in zip(found[1:], parts[1:], strict=True):
+        together = torch.where(group, part, together)
+    return together

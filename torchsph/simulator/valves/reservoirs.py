@@ -10,6 +10,8 @@ free: there only the flux is prescribed, by the same change of speed for all, an
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -26,7 +28,7 @@ from .cavity_volume import CavityVolume
 from .flux_split import fluxes, takers
 from .model import Pressure, ValveModel, ValveSetting
 from .openings import OpeningPlane, Openings
-from .plane_groups import apart, groups
+from .plane_groups import apart, measured_apart
 from .pressure_reservoirs import PressureReservoirs
 from .shared_flux import MOUTH, SharedFlux
 from .volume_match import levelled, volume_inside
@@ -83,13 +85,7 @@ class Reservoirs(ValveModel):
         times = clock.of_members(particles.members)
         if self.relaxation is None:
             return torch.zeros_like(times, dtype=self._setting.dtype)
-        deficit = torch.zeros_like(times, dtype=self._setting.dtype)
-        for group in groups(self.openings, clock, particles.members):
-            if group is None:
-                deficit = self._deficit(particles, clock)
-            else:
-                mine = self._deficit(particles.select(group[particles.member]), clock.seen_by(group))
-                deficit = torch.where(group, mine, deficit)
+        deficit = measured_apart(self.openings, particles, clock, self._deficit)
         return deficit / (self.volume.volume(times) * self.relaxation)
 
     def _lead(self, number: int, clock: Clock, members: int) -> float | Tensor:
@@ -158,9 +154,8 @@ class Reservoirs(ValveModel):
         """Give the buffers' particles their velocity for the present time; with ``channel`` also the free channels'."""
         if not clock.open_regions:
             return particles
-        return apart(
-            self.openings, particles, clock, lambda some, at: (self._driven(some, at, channel=channel), False)
-        )[0]
+        work = partial(self._driven, channel=channel)
+        return apart(self.openings, particles, clock, lambda some, at: (work(some, at), False))[0]
 
     def _driven(self, particles: Particles, clock: Clock, *, channel: bool) -> Particles:
         """The same for members that see the same planes."""
@@ -200,10 +195,7 @@ class Reservoirs(ValveModel):
         """Turn particles that have crossed an open orifice into the other kind; feed and clear the far ends."""
         if not clock.open_regions:
             return particles, False
-
-        def work(some: Particles, at: Clock) -> tuple[Particles, bool]:
-            return self._exchanged(some, at, record, pressure)
-
+        work = partial(self._exchanged, record=record, pressure=pressure)
         return apart(self.openings, particles, clock, work, stepping)
 
     def _exchanged(

@@ -11,7 +11,7 @@ limits on time and memory; an abuse ends as
 - obscure: an exception out of the depths, raised by nobody on purpose,
 - crash: the child died, hang: it was stopped.
 
-    python examples/benchmarks/abuses.py [--seconds 600] [--only WORD] [--part 0.2] [--out abuses.json]
+    python examples/benchmarks/runs/abuses.py [--seconds 600] [--only WORD] [--part 0.2] [--out abuses.json]
 """
 
 from __future__ import annotations
