@@ -1,6 +1,6 @@
 """The flow halfway between frames: by the model, and by straight and cubic lines in time.
 
-    python examples/benchmarks/resample.py TRUTH.h5 MEASURED.h5 [--every 2] [--particles M] [--members N]
+    python examples/benchmarks/haemodynamics/resample.py TRUTH.h5 MEASURED.h5 [--every 2] [--particles M] [--members N]
 
 Takes every `every`-th frame of the measurement, and compares what lies halfway between two of them with the true flow:
 
@@ -27,7 +27,7 @@ from torchsph.evaluation.frames import matching_frames
 from torchsph.evaluation.metrics import filled_velocity
 from torchsph.haemodynamics.lagrangian.moving_flow import MovingFlow
 
-RESULTS = Path(__file__).parent / "results"
+RESULTS = Path(__file__).parents[1] / "results"
 
 
 def halfway(frames: geometry.Recording, truth: geometry.Recording, particles: float | None) -> dict[str, object]:
