@@ -103,8 +103,9 @@ def _in_a_row(first: Source, paths: Sequence[Path], said: FieldMap, format: str)
         time[rows] = part.time
         for name, values in whole.items():
             values[rows] = getattr(part, name)
-    fields = {name: whole.get(name) for name in ("mask", "weight", "sigma")}
-    return replace(part, time=_times(time, said, paths[0]), velocity=whole["velocity"], **fields)
+    mask, weight, sigma = (whole.get(name) for name in ("mask", "weight", "sigma"))
+    time = _times(time, said, paths[0])
+    return replace(part, time=time, velocity=whole["velocity"], mask=mask, weight=weight, sigma=sigma)
 
 
 def _part(source: Source, said: FieldMap, *, alone: bool) -> tuple[Fields, str]:

@@ -96,9 +96,11 @@ def _closed(surface: Surface, region: int | Sequence[int]) -> Surface:
     """Every hole closed: in a plane by an edge between the ends, else by a fan or along its rim."""
     if surface.open_ridges == 0:
         return surface
-    single = isinstance(region, int | float | np.number)
-    labels = [] if single else [region_number("hole_region", one) for one in region]
-    rest = region_number("hole_region", region) if single else 0
+    labels, rest = [], 0
+    if isinstance(region, Sequence):
+        labels = [region_number("hole_region", one) for one in region]
+    else:
+        rest = region_number("hole_region", region)
     if surface.dimension == 2:
         starts = np.setdiff1d(surface.faces[:, 0], surface.faces[:, 1])
         ends = np.setdiff1d(surface.faces[:, 1], surface.faces[:, 0])

@@ -166,13 +166,6 @@ def run_methods(
     return _collected(results)
 
 
-def _read_once(resume: bool | Saved, checkpoints: str | Path | None) -> bool | Saved:
-    """What to go on from, read by the process that leads."""
-    if resume is True and checkpoints is not None and is_lead():
-        return Saved.read(Path(checkpoints)) or True
-    return resume
-
-
 def predicted_memory(
     prepared: PreparedMeasurement,
     methods: Sequence[str],
