@@ -32,9 +32,11 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
     when = parser.add_mutually_exclusive_group()
     when.add_argument("--times", type=_times, metavar="S,S,...", help="the frames' times, s")
     when.add_argument("--frame-rate", type=number(0, open_below=True), metavar="HZ", help="frames a second")
-    above = {"type": number(0, open_below=True), "metavar": "M"}
-    parser.add_argument("--spacing", help="of the grid, m (as it is)", **above)
-    parser.add_argument("--particles", help="spacing of the particles, m (the recording's grid's)", **above)
+    above = number(0, open_below=True)
+    parser.add_argument("--spacing", type=above, metavar="M", help="of the grid, m (as it is)")
+    parser.add_argument(
+        "--particles", type=above, metavar="M", help="spacing of the particles, m (the recording's grid's)"
+    )
     parser.add_argument("--linear", action="store_true", help="straight lines between frames, without the model")
     parser.add_argument("--preset", choices=tuple(PRESETS), default="default", help="of the simulator (%(default)s)")
     parser.add_argument("--device", default="cpu", metavar="D", help="cpu, cuda or cuda:N (%(default)s)")
