@@ -7,14 +7,17 @@ without walls first, and what they pass through the wall beyond their own uncert
 
 from __future__ import annotations
 
+import math
+
 from regularize import SplineField, WallRows
 
 
 def wall_trust(field: SplineField, rows: WallRows, strength: float) -> float:
     """Factor in (0, 1] on the squares of the rows of the normal velocity at shut walls.
 
-    The rows stand for an error of noise / ``strength``; what they are found to be off by beyond that and beyond the
-    spline's own deviation is added to it in squares.
+    The rows stand for an error of noise / ``strength`` each; what they are found to be off by beyond that and beyond the
+    spline's own deviation is added to it in squares. A wall that stands wrong does so for a whole patch, whose rows say
+    it only once: the error of a patch of a knot's size is that of the mean of its N rows, noise / (``strength`` N^1/2).
 
     Args:
         field: of samples alone, with ``uncertainty=True`` and an automatic choice.
@@ -30,4 +33,6 @@ def wall_trust(field: SplineField, rows: WallRows, strength: float) -> float:
     own = (normals * field.std(points[known])).square().sum(1)
     beyond = float((area * (through.square() - own)).sum() / area.sum())
     noise = float(field.choice.deviation.square().mean())
-    return 1.0 / (1.0 + strength**2 * max(beyond, 0.0) / noise)
+    patch = sorted(field.knots.spacing[: points.shape[1]])[: points.shape[1] - 1]
+    count = max(math.prod(patch) / float(area.mean()), 1.0)
+    return 1.0 / (1.0 + count * strength**2 * max(beyond, 0.0) / noise)

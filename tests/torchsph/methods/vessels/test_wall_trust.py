@@ -1,5 +1,7 @@
 """Walls of a vessel that its velocities contradict are believed less; walls that fit are believed."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -35,3 +37,12 @@ def test_a_wall_that_the_flow_goes_through_counts_by_how_much():
     fitted, rows = field_and_rows(0.2)
     noise = float(fitted.choice.deviation.square().mean())
     assert wall_trust(fitted, rows, 2.0) == pytest.approx(1 / (1 + 4 * 0.2**2 / noise), rel=0.1)
+
+
+def test_rows_that_share_a_patch_share_its_error():
+    """Four rows for each square of a knot's size say together what one says: the error counts four times as much."""
+    fitted, rows = field_and_rows(0.2)
+    noise = float(fitted.choice.deviation.square().mean())
+    area = fitted.knots.spacing[0] * fitted.knots.spacing[1] / 4
+    dense = replace(rows, weight=torch.full((len(rows.points),), area, dtype=torch.float64))
+    assert wall_trust(fitted, dense, 2.0) == pytest.approx(1 / (1 + 4 * 4 * 0.2**2 / noise), rel=0.1)
