@@ -39,7 +39,7 @@ def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
     def drawn(path: Path, *_: object) -> None:
         Path(path).write_bytes(bytes(5000))
 
-    monkeypatch.setattr(smooth, "smooth_recording", lambda measured, **_: analysed(measured))
+    monkeypatch.setattr(smooth.PreparedMeasurement, "smoothed", property(lambda prepared: analysed(prepared.recording)))
     monkeypatch.setattr(
         assimilate.by_name, "run_methods", lambda measured, *_, **__: {"spline": MethodResult(analysed(measured), 1.0)}
     )

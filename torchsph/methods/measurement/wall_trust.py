@@ -15,9 +15,9 @@ from regularize import SplineField, WallRows
 def wall_trust(field: SplineField, rows: WallRows, strength: float) -> float:
     """Factor in (0, 1] on the squares of the rows of the normal velocity at shut walls.
 
-    The rows stand for an error of noise / ``strength`` each; what they are found to be off by beyond that and beyond the
-    spline's own deviation is added to it in squares. A wall that stands wrong does so for a whole patch, whose rows say
-    it only once: the error of a patch of a knot's size is that of the mean of its N rows, noise / (``strength`` N^1/2).
+    The rows stand for an error of noise / ``strength`` each; what they are found to be off by beyond that and beyond
+    the spline's own deviation is added to it in squares. A wall that stands wrong does so for a whole patch, whose rows
+    say it only once: a patch of a knot's size has the error of the mean of its N rows, noise / (``strength`` N^1/2).
 
     Args:
         field: of samples alone, with ``uncertainty=True`` and an automatic choice.
