@@ -97,8 +97,8 @@ typedef struct { /* complete-kernel walls' part of the sums; see walls.cpp */
   int64_t count, channels;
   const void* rows;                   /* (count, channels): distance, normal, wall velocity, share, gradient, swept */
   const void* velocity;               /* (count, dimension) */
-  const void *divergence, *crowding;  /* rates: (count,), (count, dimension) or null */
-  void *whole_divergence, *whole_crowding;
+  const void *divergence, *concentration_gradient;  /* rates: (count,), (count, dimension) or null */
+  void *whole_divergence, *whole_concentration_gradient;
   const void *pressure, *deviation;   /* forces: (count,) each, or null without pressure */
   const double* viscosity;            /* (viscosities,): 0 without friction, 1 for all, or one per member */
   int64_t viscosities;

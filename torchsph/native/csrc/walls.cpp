@@ -33,8 +33,8 @@ template <class Real, int D>
 void rates(const sph_walls& a) {
   const auto* rows = static_cast<const Real*>(a.rows);
   const auto *velocity = static_cast<const Real*>(a.velocity), *divergence = static_cast<const Real*>(a.divergence),
-             *crowding = static_cast<const Real*>(a.crowding);
-  auto *whole = static_cast<Real*>(a.whole_divergence), *even = static_cast<Real*>(a.whole_crowding);
+             *concentration_gradient = static_cast<const Real*>(a.concentration_gradient);
+  auto *whole = static_cast<Real*>(a.whole_divergence), *even = static_cast<Real*>(a.whole_concentration_gradient);
   const bool sliding = a.channels > 2 + 3 * D;
   const Real least = Real(a.smallest_share);
 #pragma omp parallel for schedule(static) num_threads(a.threads)
@@ -43,8 +43,8 @@ void rates(const sph_walls& a) {
     const Real* v = velocity + i * D;
     const Real *g = wall.gradient(), coming = sliding ? wall.swept() : dot<Real, D>(wall.velocity(), g);
     whole[i] = (divergence[i] - (coming - dot<Real, D>(v, g))) / std::max(wall.share(), least);
-    if (crowding)
-      for (int d = 0; d < D; ++d) even[i * D + d] = crowding[i * D + d] - g[d];
+    if (concentration_gradient)
+      for (int d = 0; d < D; ++d) even[i * D + d] = concentration_gradient[i * D + d] - g[d];
   }
 }
 

@@ -37,9 +37,9 @@ def complete_rates(
             velocity,
             velocity=velocity.data_ptr(),
             divergence=divergence.data_ptr(),
-            crowding=address(gradient),
+            concentration_gradient=address(gradient),
             whole_divergence=whole.data_ptr(),
-            whole_crowding=address(even),
+            whole_concentration_gradient=address(even),
         )
     )
     return whole, even
