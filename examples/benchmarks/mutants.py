@@ -19,26 +19,23 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
-import resource
-import select
-import signal
 import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import h5py
 import numpy as np
+from runs.limited_child import in_child
 
 import geometry
 from geometry.recordings.checks import findings
 from geometry.recordings.recording import LAYOUT
 
 HANG = 20.0  # s
-MEMORY = 4 << 30  # bytes beyond what the process has
 HARM = ("obscure", "crash", "hang")
 DATASETS = tuple(dataset for _, dataset, _ in LAYOUT)
 ATTRIBUTES = ("format", "format_version", "dimension", "rho", "mu", "period", "description")
@@ -224,38 +221,6 @@ def said(path: Path) -> tuple[str, str]:
     return "read", str(hash(tuple(map(repr, parts))))
 
 
-def in_child(path: Path) -> tuple[str, str]:
-    """The same, by a child with limits: also how it died."""
-    reader, writer = os.pipe()
-    child = os.fork()
-    if not child:
-        os.close(reader)
-        used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-        resource.setrlimit(resource.RLIMIT_AS, (used + MEMORY, used + MEMORY))
-        os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
-        with os.fdopen(writer, "w", encoding="utf-8", errors="replace") as pipe:
-            json.dump(said(path), pipe)
-        os._exit(0)
-    os.close(writer)
-    answer, end = b"", time.monotonic() + HANG
-    while select.select([reader], [], [], max(0.0, end - time.monotonic()))[0]:
-        part = os.read(reader, 1 << 16)
-        if not part:
-            break
-        answer += part
-    else:
-        os.kill(child, signal.SIGKILL)
-    os.close(reader)
-    status = os.waitpid(child, 0)[1]
-    if os.WIFSIGNALED(status):
-        number = os.WTERMSIG(status)
-        return ("hang", f"more than {HANG:g} s") if number == signal.SIGKILL else ("crash", f"signal {number}")
-    if not answer:
-        return "crash", "no answer"
-    kind, text = json.loads(answer)
-    return kind, text
-
-
 def main() -> None:
     """Read mutants until their number or the time is up."""
     parser = argparse.ArgumentParser(description=str(__doc__).splitlines()[0])
@@ -274,7 +239,7 @@ def main() -> None:
         else:
             path.write_bytes(args.file.read_bytes())
         sound = path.read_bytes()
-        kind, same = in_child(path)
+        kind, same = in_child(partial(said, path), HANG)
         assert kind == "read", same
         while len(rows) < args.mutants and time.perf_counter() - began < args.seconds:
             number = len(rows)
@@ -282,7 +247,7 @@ def main() -> None:
             mutate = MUTATIONS[number % len(MUTATIONS)]
             path.write_bytes(sound)
             how = mutate(path, draw)
-            kind, text = in_child(path)
+            kind, text = in_child(partial(said, path), HANG)
             if kind == "read":
                 kind = "same result" if text == same else "another result"
             rows.append({"mutation": mutate.__name__, "how": how, "ended": kind, "said": text[:500]})

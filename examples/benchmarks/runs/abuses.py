@@ -20,10 +20,6 @@ import argparse
 import json
 import linecache
 import math
-import os
-import resource
-import select
-import signal
 import tempfile
 import time
 import traceback
@@ -31,18 +27,19 @@ import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import fields, is_dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from limited_child import in_child
 
 import geometry
 import regularize as reg
 import torchsph as ts
 
 HANG = 30.0  # s
-MEMORY = 4 << 30  # bytes beyond what the process has
 KINDS = ("clear", "same", "accepted", "silent", "obscure", "crash", "hang")
 HARM = ("silent", "obscure", "crash", "hang")
 OURS = tuple(str(Path(package.__file__).parent) for package in (ts, geometry, reg))
@@ -171,39 +168,6 @@ def outcome(call: Callable[[], object]) -> tuple[str, str]:
     return "read" if finite else "silent", text
 
 
-def in_child(call: Callable[[], object]) -> tuple[str, str]:
-    """The same, by a child with limits: also how it died."""
-    reader, writer = os.pipe()
-    child = os.fork()
-    if not child:
-        os.close(reader)
-        used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-        resource.setrlimit(resource.RLIMIT_AS, (used + MEMORY, used + MEMORY))
-        for stream in (1, 2):
-            os.dup2(os.open(os.devnull, os.O_WRONLY), stream)
-        with os.fdopen(writer, "w", encoding="utf-8", errors="replace") as pipe:
-            json.dump(outcome(call), pipe)
-        os._exit(0)
-    os.close(writer)
-    answer, end = b"", time.monotonic() + HANG
-    while select.select([reader], [], [], max(0.0, end - time.monotonic()))[0]:
-        part = os.read(reader, 1 << 16)
-        if not part:
-            break
-        answer += part
-    else:
-        os.kill(child, signal.SIGKILL)
-    os.close(reader)
-    status = os.waitpid(child, 0)[1]
-    if os.WIFSIGNALED(status):
-        number = os.WTERMSIG(status)
-        return ("hang", f"more than {HANG:g} s") if number == signal.SIGKILL else ("crash", f"signal {number}")
-    if not answer:
-        return "crash", "no answer"
-    kind, text = json.loads(answer)
-    return kind, text
-
-
 Call = tuple[Callable[..., object], dict[str, Any]]
 
 
@@ -226,7 +190,7 @@ def main() -> None:
                 continue
             if time.perf_counter() - began > args.seconds:
                 break
-            kind, same = in_child(lambda function=function, sound=sound: function(**sound))
+            kind, same = in_child(partial(outcome, partial(function, **sound)), HANG)
             assert kind == "read", (name, kind, same)
             for argument, value in sound.items():
                 for how, other in wrong(value):
@@ -235,7 +199,7 @@ def main() -> None:
                     if draw.random() > args.part:
                         continue
                     given = sound | {argument: other}
-                    kind, text = in_child(lambda function=function, given=given: function(**given))
+                    kind, text = in_child(partial(outcome, partial(function, **given)), HANG)
                     if kind == "read":
                         kind = "same" if text == same else "accepted"
                     rows.append({"call": name, "argument": argument, "wrong": how, "ended": kind, "said": text[:400]})

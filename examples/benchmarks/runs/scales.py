@@ -15,6 +15,7 @@ import resource
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -48,7 +49,7 @@ def tube(radius: float, length: float, spacing: float, peak: float) -> tuple[geo
     true[:, 2] = peak * np.clip(1 - square, 0.0, None)
     wall = geometry.Wall(surface.vertices, surface.faces, surface.region)
     rows = np.array([[1.0, -1.0, 1.0], [2.0, -1.0, 1.0]])
-    return noisy(true, grid, square < 0.999, peak, wall=wall, valve_intervals=rows), true
+    return replace(noisy(true, grid, square < 0.999, peak), wall=wall, valve_intervals=rows), true
 
 
 def plane(side: int, spacing: float) -> tuple[geometry.Recording, np.ndarray]:
@@ -63,13 +64,11 @@ def plane(side: int, spacing: float) -> tuple[geometry.Recording, np.ndarray]:
     return noisy(true, grid, np.ones((side, side), bool), float(np.abs(true).max())), true
 
 
-def noisy(true: np.ndarray, grid: geometry.Grid, mask: np.ndarray, peak: float, **parts: object) -> geometry.Recording:
+def noisy(true: np.ndarray, grid: geometry.Grid, mask: np.ndarray, peak: float) -> geometry.Recording:
     """The true velocity as it might be measured."""
     noise = 0.1 * peak * np.random.default_rng(0).standard_normal(true.shape)
-    wall = parts.pop("wall", None)
-    return geometry.Recording(
-        TIME, grid, np.where(mask, true + noise, 0).astype(np.float32), mask, wall, 1060.0, 4e-3, **parts
-    )
+    measured = np.where(mask, true + noise, 0).astype(np.float32)
+    return geometry.Recording(TIME, grid, measured, mask, None, 1060.0, 4e-3)
 
 
 def measure(name: str) -> dict[str, float]:

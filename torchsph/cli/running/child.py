@@ -7,15 +7,14 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from torchsph.methods.runtime.watching import Stopped
 
 from ..exit_codes import ExitCode
-from .stopping import SIGNALS
+from .stopping import SIGNALS, handled
 
 # s that a child has to end after it was asked to, before it is killed
 GRACE = 60.0
@@ -53,7 +52,8 @@ def run_child(arguments: Sequence[str], log: Path, limit: float | None = None) -
         call = [sys.executable, "-m", "torchsph", *arguments]
         late = False
         came: list[int] = []
-        with _held(came):
+        # kept meanwhile: a request to stop that struck amid the start of a child would leave it behind
+        with handled((*SIGNALS, signal.SIGINT), lambda number, frame: came.append(number)):
             process = subprocess.Popen(call, stdin=subprocess.DEVNULL, stdout=handle, stderr=handle)
         try:
             try:
@@ -77,22 +77,6 @@ def run_child(arguments: Sequence[str], log: Path, limit: float | None = None) -
     if status == -signal.SIGKILL:
         return Outcome(ExitCode.MEMORY, seconds, f"was killed ({name}), most likely because memory ran out")
     return Outcome(ExitCode.OURS, seconds, f"crashed ({name})")
-
-
-@contextmanager
-def _held(came: list[int]) -> Iterator[None]:
-    """Keep requests to stop in ``came`` meanwhile: one that struck amid the start of a child would leave it behind."""
-    before = {}
-    try:
-        for one in (*SIGNALS, signal.SIGINT):
-            before[one] = signal.signal(one, lambda number, frame: came.append(number))
-    except ValueError:  # not in the main thread: no signal strikes here
-        pass
-    try:
-        yield
-    finally:
-        for one, handler in before.items():
-            signal.signal(one, signal.SIG_DFL if handler is None else handler)
 
 
 def _ended(process: subprocess.Popen[bytes], by: signal.Signals) -> int:

@@ -185,7 +185,10 @@ class Cycle:
         self.analyses.restore(state["analyses"])
         if self.member_frames is not None:
             if "member frames" not in state:
-                raise ValueError("the checkpoint holds no members; start anew, or go on without --keep-members")
+                raise ValueError(
+                    "the checkpoint holds no members; start anew, or go on without what is read out of them "
+                    "(--no-quantities, and no --keep-members)"
+                )
             self.member_frames.restore(state["member frames"])
 
 
