@@ -11,7 +11,7 @@ import numpy as np
 
 from geometry.grids.grid import Grid
 from geometry.recordings.read import read_recording
-from geometry.recordings.recording import Recording
+from geometry.recordings.recording import Recording, Wall
 from geometry.recordings.units import factor
 from geometry.surfaces.files import SUFFIXES
 
@@ -130,10 +130,12 @@ def _walled(fields: Fields, said: FieldMap, options: WallOptions, about: _Consta
         if wall.moves and len(wall.vertices) != len(fields.time):
             raise FormatError(f"{files[0]}: {len(files)} walls for {len(fields.time)} frames of velocity")
     if mask is None and wall is not None:
-        mask = np.stack([inside_at(wall, frame, grid) for frame in range(len(fields.time))])
+        mask = _inside(wall, len(fields.time), grid)
         notes.append("no mask is named: the inside of the wall is taken")
     elif mask is None:
-        moving = (known & (np.abs(np.nan_to_num(velocity)).max(axis=1) > 0)).any(axis=0)
+        moving = np.zeros(grid.shape, bool)
+        for seen, field in zip(known, velocity, strict=True):
+            moving |= seen & (field != 0).any(axis=0)
         mask = np.broadcast_to(moving, known.shape)
         notes.append("no mask is named: nodes that ever move are taken as blood")
     if wall is None:
@@ -149,7 +151,7 @@ def _walled(fields: Fields, said: FieldMap, options: WallOptions, about: _Consta
     weight = fields.weight
     unknown = mask & ~known
     if unknown.any():
-        weight = np.where(known, 1.0 if weight is None else weight, 0.0)
+        weight = np.where(known, np.float32(1) if weight is None else weight, np.float32(0))
         notes.append(f"{int(unknown.sum())} nodes in the mask have no value: weight 0")
     recording = Recording(
         fields.time,
@@ -165,6 +167,16 @@ def _walled(fields: Fields, said: FieldMap, options: WallOptions, about: _Consta
         period=about.period,
     )
     return Converted(recording, tuple(notes))
+
+
+def _inside(wall: Wall, frames: int, grid: Grid) -> np.ndarray:
+    """The nodes inside a wall, (T, *grid)."""
+    if not wall.moves:
+        return np.broadcast_to(inside_at(wall, 0, grid), (frames, *grid.shape))
+    mask = np.empty((frames, *grid.shape), bool)
+    for frame in range(frames):
+        mask[frame] = inside_at(wall, frame, grid)
+    return mask
 
 
 def _walls_alone(
@@ -184,7 +196,7 @@ def _walls_alone(
     step = said.interval if said.interval is not None else said.period / count
     points = wall.vertices.reshape(-1, 3)
     grid = Grid.covering(tuple(points.min(axis=0)), tuple(points.max(axis=0)), said.grid_spacing)
-    mask = np.stack([inside_at(wall, frame if wall.moves else 0, grid) for frame in range(count)])
+    mask = _inside(wall, count, grid)
     recording = Recording(
         step * np.arange(count),
         grid,
