@@ -19,7 +19,7 @@ from .placing import fill_scalar, fill_vectors
 from .source import ArrayLike, FormatError, Source
 
 MIRROR = {"ras": np.array([-1.0, -1.0, 1.0])}  # to LPS, the coordinates that DICOM, ITK and surfaces of Slicer use
-WHOLE = (".h5", ".hdf5", ".hdf", ".he5", ".mat", ".npz", ".vtkhdf", ".nc", ".nc4", ".nii", ".gz", ".nrrd", ".mha", ".vti", ".vtk")
+WHOLE = (".h5", ".hdf5", ".hdf", ".he5", ".mat", ".npz", ".vtkhdf", ".nc", ".nc4", ".nii", ".gz", ".nrrd", ".mha", ".vti", ".vtk", ".zarr")
 DECLARED = 64 * 2**30  # bytes; a file that claims a larger result is refused before anything is read
 
 
@@ -145,9 +145,10 @@ def _check_size(source: Source, name: str, needed: int, claimed: str) -> None:
     if needed > DECLARED:
         raise FormatError(f"{source.path}: {name}: claims {claimed}, more than memory holds")
     path = Path(source.path)
-    if path.suffix.lower() in WHOLE and path.is_file() and needed > UNWRITTEN + PACKED * path.stat().st_size:
+    size = sum(part.stat().st_size for part in (path.rglob("*") if path.is_dir() else [path]) if part.is_file())
+    if path.suffix.lower() in WHOLE and path.exists() and needed > UNWRITTEN + PACKED * size:
         raise FormatError(
-            f"{source.path}: {name}: claims {claimed}, but the whole file has {path.stat().st_size} bytes; write the "
+            f"{source.path}: {name}: claims {claimed}, but the whole file has {size} bytes; write the "
             "values, or name other arrays"
         )
 

@@ -16,11 +16,12 @@ from geometry.recordings.units import factor
 from geometry.surfaces.files import SUFFIXES
 
 from .assemble import Fields
+from .displacement import MotionOptions
 from .field_map import FieldMap
 from .readers.hdf5 import text
 from .series import read_fields
 from .source import FormatError
-from .walls import inside_at, wall_from_files, wall_from_mask
+from .walls import inside_at, wall_by_displacements, wall_from_files, wall_from_mask
 
 
 @dataclass(frozen=True)
@@ -33,6 +34,7 @@ class WallOptions:
         openings: how many of the longest holes of the files are orifices, regions 1, 2, ...
         unite: bodies that overlap become one.
         smoothing: passes of Taubin's filter over a wall from a mask.
+        motion: displacements by which the one surface moves.
     """
 
     files: tuple[str, ...] = ()
@@ -40,6 +42,7 @@ class WallOptions:
     openings: int = 0
     unite: bool = False
     smoothing: int = 0
+    motion: MotionOptions = MotionOptions()
 
     def scale(self, said: FieldMap) -> float:
         """Metres per unit of the files; that of the fields where the wall's is not said."""
@@ -96,7 +99,7 @@ def convert(
     paths = [Path(name) for name in inputs]
     if not paths:
         raise FormatError("convert: no file is named")
-    missing = [path for path in (*paths, *map(Path, wall.files)) if not path.exists()]
+    missing = [path for path in (*paths, *map(Path, (*wall.files, *wall.motion.files))) if not path.exists()]
     if missing:
         raise FileNotFoundError(f"{missing[0]}: there is no such file")
     about = _Constants(rho, mu, said.period)
@@ -123,10 +126,12 @@ def _walled(fields: Fields, said: FieldMap, options: WallOptions, about: _Consta
     notes, grid, velocity, mask = list(fields.notes), fields.grid, fields.velocity, fields.mask
     known = np.isfinite(velocity).all(axis=1)
     wall = None
+    if options.motion.files and not options.files:
+        raise FormatError(f"{options.motion.files[0]}: moves a wall: name its surface (--wall)")
     if options.files:
         files = [Path(name) for name in options.files]
         turn = None if (fields.turn == np.eye(grid.dimension)).all() else fields.turn
-        wall = wall_from_files(files, options.scale(said), openings=options.openings, unite=options.unite, turn=turn)
+        wall, _ = _wall(files, said, options, fields.time, about.period, turn)
         if wall.moves and len(wall.vertices) != len(fields.time):
             raise FormatError(f"{files[0]}: {len(files)} walls for {len(fields.time)} frames of velocity")
     if mask is None and wall is not None:
@@ -169,6 +174,32 @@ def _walled(fields: Fields, said: FieldMap, options: WallOptions, about: _Consta
     return Converted(recording, tuple(notes))
 
 
+def _wall(
+    files: Sequence[Path],
+    said: FieldMap,
+    options: WallOptions,
+    time: np.ndarray | None,
+    period: float,
+    turn: np.ndarray | None,
+) -> tuple[Wall, np.ndarray | None]:
+    """The wall of files, at the frames of the velocity where it moves, and the times of its own motion, if any."""
+    scale, openings, unite = options.scale(said), options.openings, options.unite
+    if not options.motion.files:
+        return wall_from_files(files, scale, openings=openings, unite=unite, turn=turn), None
+    if len(files) > 1:
+        raise FormatError(f"{files[1]}: a wall that moves by displacements has one surface; name the first alone")
+    return wall_by_displacements(
+        files[0],
+        options.motion,
+        scale,
+        time=time,
+        period=period,
+        openings=openings,
+        unite=unite,
+        turn=turn,
+    )
+
+
 def _inside(wall: Wall, frames: int, grid: Grid) -> np.ndarray:
     """The nodes inside a wall, (T, *grid)."""
     if not wall.moves:
@@ -189,16 +220,17 @@ def _walls_alone(
         )
     if options.files:
         raise FormatError(f"{paths[0]}: is a surface itself; name files of velocity before --wall")
-    wall = wall_from_files(paths, options.scale(said), openings=options.openings, unite=options.unite)
-    count = len(paths)
-    if count > 1 and said.interval is None and not said.period:
+    wall, stated = _wall(paths, said, options, None, said.period, None)
+    count = len(wall.vertices) if wall.moves else 1
+    if count > 1 and stated is None and said.interval is None and not said.period:
         raise FormatError(f"{paths[0]}: when were the {count} walls? Say it (--interval S or --period S)")
     step = said.interval if said.interval is not None else said.period / count
+    time = step * np.arange(count) if said.interval is not None or stated is None else stated
     points = wall.vertices.reshape(-1, 3)
     grid = Grid.covering(tuple(points.min(axis=0)), tuple(points.max(axis=0)), said.grid_spacing)
     mask = _inside(wall, count, grid)
     recording = Recording(
-        step * np.arange(count),
+        time,
         grid,
         np.zeros((count, 3, *grid.shape), np.float32),
         mask,

@@ -13,6 +13,7 @@ from geometry.surfaces.files import read_surface
 from geometry.surfaces.segmentation import surface_from_mask
 from geometry.surfaces.surface import Surface, SurfaceError, pieces_of
 
+from .displacement import MotionOptions, read_displacements
 from .source import FormatError
 
 BEYOND = 0.25  # of a spacing: a face further outside the box of nodes closes a cut vessel
@@ -52,6 +53,42 @@ def wall_from_files(
             raise FormatError(f"{path}: has other faces than {paths[0]}; a moving wall keeps its triangles over time")
         frames[frame] = _turned(plan @ surface.vertices, turn)
     return Wall(frames, whole.faces, whole.region)
+
+
+def wall_by_displacements(
+    path: Path,
+    options: MotionOptions,
+    scale: float,
+    *,
+    time: np.ndarray | None,
+    period: float,
+    openings: int = 0,
+    unite: bool = False,
+    turn: np.ndarray | None = None,
+) -> tuple[Wall, np.ndarray | None]:
+    """The wall of a file that moves by displacements, and their times where they have any.
+
+    Args:
+        path: of the surface where it has not moved.
+        options: the displacements.
+        scale: m per unit of the surface file.
+        time: (T,), s, of the frames wanted; None: those of the displacements.
+        period: s; 0 = not periodic.
+        openings: how many of the longest holes are orifices.
+        unite: bodies that overlap become one.
+        turn: (3, 3), from the recording's coordinates to the files'.
+
+    Raises:
+        FormatError: the displacements cannot be read, or do not reach the wall or its frames.
+        SurfaceError: the surface cannot be read or mended.
+    """
+    whole = read_surface(path, scale=scale, hole_region=tuple(range(1, openings + 1)), unite=unite)
+    raw = read_surface(path, scale=scale, mend=False)
+    motion = read_displacements(options, raw.vertices, scale)
+    plan = _provenance(whole, raw, path)
+    frames = motion.moved(raw.vertices, time, period, Path(options.files[0]))
+    vertices = np.stack([_turned(plan @ places, turn) for places in frames])
+    return Wall(vertices, whole.faces, whole.region), motion.time
 
 
 def wall_from_mask(mask: np.ndarray, grid: Grid, *, smoothing: int = 0) -> Wall:
