@@ -33,6 +33,7 @@ class WallOptions:
         unit: of the files, a name or a number of metres.
         openings: how many of the longest holes of the files are orifices, regions 1, 2, ...
         unite: bodies that overlap become one.
+        sheet: of a wall of finite thickness, `inner` is the blood's surface; `all` if the blood is what it encloses.
         smoothing: passes of Taubin's filter over a wall from a mask.
         motion: displacements by which the one surface moves.
     """
@@ -43,6 +44,7 @@ class WallOptions:
     unite: bool = False
     smoothing: int = 0
     motion: MotionOptions = MotionOptions()
+    sheet: str = ""
 
     def scale(self, said: FieldMap) -> float:
         """Metres per unit of the files; that of the fields where the wall's is not said."""
@@ -183,9 +185,9 @@ def _wall(
     turn: np.ndarray | None,
 ) -> tuple[Wall, np.ndarray | None]:
     """The wall of files, at the frames of the velocity where it moves, and the times of its own motion, if any."""
-    scale, openings, unite = options.scale(said), options.openings, options.unite
+    scale, openings, unite, sheet = options.scale(said), options.openings, options.unite, options.sheet
     if not options.motion.files:
-        return wall_from_files(files, scale, openings=openings, unite=unite, turn=turn), None
+        return wall_from_files(files, scale, openings=openings, unite=unite, sheet=sheet, turn=turn), None
     if len(files) > 1:
         raise FormatError(f"{files[1]}: a wall that moves by displacements has one surface; name the first alone")
     return wall_by_displacements(
@@ -196,6 +198,7 @@ def _wall(
         period=period,
         openings=openings,
         unite=unite,
+        sheet=sheet,
         turn=turn,
     )
 

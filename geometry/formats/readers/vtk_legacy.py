@@ -67,6 +67,8 @@ def read_legacy(path: Path) -> LegacyImage | None:
             if head[3].upper().split() != [b"DATASET", b"STRUCTURED_POINTS"]:
                 return None
             return _Parser(path, file).image()
+        except FormatError:
+            raise
         except (NotPlain, ValueError, KeyError, IndexError):
             return None
 

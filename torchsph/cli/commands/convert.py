@@ -59,6 +59,9 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
     walls.add_argument("--wall-unit", default="", metavar="UNIT", help="of its lengths (that of the fields)")
     walls.add_argument("--openings", type=int, default=0, metavar="N", help="its N longest holes are orifices")
     walls.add_argument("--unite", action="store_true", help="bodies that overlap become one")
+    walls.add_argument(
+        "--sheet", default="", choices=["inner", "all"], help="of a wall of finite thickness: the blood's surface, or all"
+    )
     walls.add_argument("--motion", nargs="+", default=[], metavar="FILE", help="displacements that move the one surface")
     walls.add_argument("--motion-map", metavar="MAP.toml", help="their field map; `velocity` names the displacements")
     walls.add_argument("--motion-arrays", metavar="NAME[,NAME]", help="the displacements among the arrays of the files")
@@ -74,7 +77,15 @@ def convert(args: argparse.Namespace) -> None:
     """Run `torchsph convert`."""
     said = read_field_map(args.map) if args.map else FieldMap()
     said = replace(said, **_given(args))
-    wall = WallOptions(tuple(args.wall), args.wall_unit, args.openings, args.unite, args.smoothing, _motion(args))
+    wall = WallOptions(
+        tuple(args.wall),
+        args.wall_unit,
+        openings=args.openings,
+        unite=args.unite,
+        smoothing=args.smoothing,
+        motion=_motion(args),
+        sheet=args.sheet,
+    )
     result = convert_files(
         args.inputs, said, format=args.format, wall=wall, rho=args.rho, mu=args.mu, description=args.description
     )
