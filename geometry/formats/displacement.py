@@ -1,8 +1,8 @@
 """A wall that moves by displacements: of a field on a grid over time, or of each vertex.
 
 A displacement tells how far a point of the surface file is from its place there, at each frame: x(t) = X + u(X, t).
-Between nodes a field is interpolated linearly along each axis, as ITK does by default, and between its times linearly in
-time. A vertex outside of the field, or beside a node without a value, is refused: nothing is extrapolated.
+Between nodes a field is interpolated linearly along each axis, as ITK does by default, and between its times linearly
+in time. A vertex outside of the field, or beside a node without a value, is refused: nothing is extrapolated.
 """
 
 from __future__ import annotations
@@ -147,7 +147,7 @@ def _by_vertices(source: Source, name: str, vertices: np.ndarray, unit: float, s
 
 
 def _sampled(grid: Grid, field: np.ndarray, turn: np.ndarray, points: np.ndarray, path: Path) -> np.ndarray:
-    """Displacements (T, n, 3), m, of points in the file's coordinates; the grid and its field are turned back by `turn`."""
+    """Displacements (T, n, 3), m, of points in the file's coordinates, by a grid and field turned back by `turn`."""
     places = points @ turn
     low, high = np.asarray(grid.origin), np.asarray(grid.upper)
     beyond = np.maximum(low - places, places - high).max(axis=1)
@@ -186,5 +186,3 @@ def _between(places: np.ndarray, own: np.ndarray, time: np.ndarray, period: floa
     after = np.clip(np.searchsorted(own, time), 1, len(own) - 1)
     share = np.clip((time - own[after - 1]) / (own[after] - own[after - 1]), 0, 1)[:, None, None]
     return (1 - share) * places[after - 1] + share * places[after]
-
-

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import IO
 
@@ -48,7 +49,7 @@ def element(path: Path, name: str, shape: tuple[int, ...]) -> Streamed:
                 first = found[1] if packed else stream.tell()
             return Streamed(
                 path,
-                (lambda: _unpacked(path, start)) if packed else (lambda: path.open("rb")),
+                partial(_unpacked, path, start) if packed else partial(path.open, "rb"),
                 first,
                 shape,
                 np.dtype(found[2]).newbyteorder(order),
