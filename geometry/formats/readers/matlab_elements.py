@@ -49,10 +49,10 @@ def element(path: Path, name: str, shape: tuple[int, ...]) -> Streamed:
                 first = found[1] if packed else stream.tell()
             return Streamed(
                 path,
-                partial(_unpacked, path, start) if packed else partial(path.open, "rb"),
+                partial(_unpacked, path, start) if packed else partial(_plain, path),
                 first,
                 shape,
-                np.dtype(found[2]).newbyteorder(order),
+                np.dtype(order + found[2]),
                 order="F",
                 stored=size,
                 packed=packed,
@@ -74,6 +74,10 @@ def _elements(path: Path) -> Iterator[tuple[int, int, bool, str]]:
             if kind in (MATRIX, COMPRESSED):
                 yield at + 8, min(size, end - at - 8), kind == COMPRESSED, order
             at += 8 + size + (-size % 8 if kind != COMPRESSED else 0)
+
+
+def _plain(path: Path) -> IO[bytes]:
+    return path.open("rb")
 
 
 def _unpacked(path: Path, start: int) -> IO[bytes]:

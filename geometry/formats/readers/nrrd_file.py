@@ -95,7 +95,7 @@ def _gunzipped(path: Path, start: int) -> IO[bytes]:
     file = path.open("rb")
     file.seek(start)
     stream = gzip.GzipFile(fileobj=file, mode="rb")
-    stream.myfileobj = file  # is closed with it
+    stream.myfileobj = file  # type: ignore[assignment]  # is closed with it
     return cast(IO[bytes], stream)
 
 
