@@ -1,4 +1,4 @@
-"""Derivatives of the pair sums and of the pressure equation, checked by differences (``gradcheck``) in double precision."""
+"""Derivatives of the pair sums and of the pressure equation, checked by differences in double precision."""
 
 from __future__ import annotations
 

@@ -1,10 +1,12 @@
-"""Gradients through imposing, advancing and fetching, against differences in double precision; what they cost in memory.
+"""Gradients through imposing, advancing and fetching, against differences in double precision; the memory they take.
 
 What is differentiated are whole forecasts: moving walls, valves that pass flow, both schemes. Solves are tight where
 differences are taken, because a loose one is no function of its arguments to the last digits.
 """
 
 import dataclasses
+import runpy
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -162,3 +164,12 @@ def test_the_tape_keeps_a_step_in_few_bytes_a_particle():
 def test_gradients_that_nobody_prepared_for_are_refused_with_the_cure():
     with pytest.raises(ValueError, match="Simulator with differentiable=True"):
         stirred(SCHEMES["default"], draw((256, 2), 2).requires_grad_(), differentiable=False)
+
+
+@pytest.mark.slow
+def test_viscosity_and_flux_are_found_from_a_noisy_measurement():
+    """``examples/fit_viscosity_and_flux.py``: both start a factor of two off; noise as large as a sixth of the flow."""
+    path = Path(__file__).parents[3] / "examples" / "fit_viscosity_and_flux.py"
+    example = runpy.run_path(str(path))
+    viscosity, flux = example["fitted"](0.05, 2).tolist()
+    assert viscosity == pytest.approx(1.0, abs=0.1) and flux == pytest.approx(1.0, abs=0.03)

@@ -261,8 +261,8 @@ class _Inputs:
         for (owner, name, _), value in zip(self._places(), arrays, strict=True):
             changed[owner][name] = value
         return _Inputs(
-            replace(self.state, **changed["state"]),  # type: ignore[arg-type]
-            replace(self.support, **changed["support"]),  # type: ignore[arg-type]
+            replace(self.state, **changed["state"]),
+            replace(self.support, **changed["support"]),
             None if self.momentum is None else replace(self.momentum, **changed["momentum"]),  # type: ignore[arg-type]
             changed[""].get("field"),
         )

@@ -119,7 +119,7 @@ class Neighbourhood:
             count = count.index_add(0, row, weight * part)
             total = total.index_add(0, row, weight * part * filling)
         mean = torch.where(count > 0, total / count.clamp_min(_SMALLEST), torch.ones_like(count))
-        level = sum(part * mean[row] for row, part in zip(rows, parts, strict=True))
+        level = parts[0] * mean[rows[0]] + parts[1] * mean[rows[1]]
         excess = (filling / level.clamp_min(_SMALLEST) - 1.0).clamp(-_LARGEST_EXCESS, _LARGEST_EXCESS)
         excess = torch.where(counted, excess, torch.zeros_like(excess))
         rest = p.per_member(excess, "sum") / p.per_member(weight, "sum").clamp_min(1.0)

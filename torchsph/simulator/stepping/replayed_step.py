@@ -97,7 +97,7 @@ class Step:
 
     def _inputs(self, particles: Particles) -> dict[str, Tensor]:
         """All tensors of real numbers that the step depends on, by place and name."""
-        found = {f"particles.{name}": value for name, value in _arrays(particles).items()}
+        found: dict[str, float | Tensor | None] = {f"particles.{n}": value for n, value in _arrays(particles).items()}
         c = self.stepper.coefficients
         found |= {f"coefficients.{f.name}": getattr(c, f.name) for f in fields(c)}
         clock = self.surroundings.clock
@@ -162,7 +162,9 @@ class _Replayed(torch.autograd.Function):
         """See ``torch.autograd.Function``."""
         wanted = ctx.needs_input_grad[3:]
         with torch.enable_grad():
-            values = [value.detach().requires_grad_(need) for value, need in zip(ctx.saved_tensors, wanted, strict=True)]
+            values = [
+                value.detach().requires_grad_(need) for value, need in zip(ctx.saved_tensors, wanted, strict=True)
+            ]
             found = ctx.once_more(tuple(values))
             some = [
                 (found[name], g)
