@@ -262,7 +262,7 @@ class _Inputs:
             changed[owner][name] = value
         return _Inputs(
             replace(self.state, **changed["state"]),
-            replace(self.support, **changed["support"]),
+            replace(self.support, **changed["support"]),  # type: ignore[arg-type]
             None if self.momentum is None else replace(self.momentum, **changed["momentum"]),  # type: ignore[arg-type]
             changed[""].get("field"),
         )
