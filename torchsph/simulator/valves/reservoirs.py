@@ -64,7 +64,8 @@ class Reservoirs(ValveModel):
             setting.dtype,
         )
         self._shared = SharedFlux(self.openings, self.volume)
-        self.takes_strength = bool(self.openings.given)
+        self._given_fluxes = any(self.openings.valve(number).flux is not None for number in range(self.buffers))
+        self.takes_strength = bool(self.openings.given) or self._given_fluxes
 
     def pressure_reservoirs(self, backend: Backend) -> PressureReservoirs | None:
         """What drives the buffers of valves with a given pressure, or None."""
@@ -98,6 +99,8 @@ class Reservoirs(ValveModel):
         shared = (
             self.openings.valve(number).flux is None and len(takers(self.openings, self.openings.active(clock))) > 1
         )
+        if self._given_fluxes and isinstance(clock.valve_strength, Tensor):  # members have each their own
+            shared = True
         inflow = torch.full((members if shared else 1,), self.volume.rate_at(clock.middle), dtype=self._setting.dtype)
         through = fluxes(self.openings, clock, inflow.to(self._setting.device), time=clock.middle)[number]
         if shared:
