@@ -11,7 +11,9 @@ from torch import Tensor
 
 import geometry
 from torchsph.assimilation import Analysis
+from torchsph.haemodynamics.fields.continuity import MassBalance
 
+from ..measurement.wall_rows import open_regions
 from .divergence_cleaning import without_divergence
 from .forecaster import Ensemble
 from .lagged import Lagged, LaggedAnalyses
@@ -23,9 +25,10 @@ class Analyses:
     Args:
         measured: the recording whose frames they belong to.
         lag: cycles whose data still move an analysis, or None.
+        motion: of the walls whose balance of mass the fields keep; None: they keep their own.
 
     Attributes:
-        fields: (D, *shape) for each frame, m/s, freed of divergence.
+        fields: (D, *shape) for each frame, m/s, of the walls' balance of mass and without divergence.
         sigmas: (D, *shape) for each frame, m/s, what the filter claims.
         missing: nodes for each frame that the forecast did not cover.
         quality: (*shape) uint8 for each frame, codes of ``geometry.Quality``.
@@ -40,8 +43,11 @@ class Analyses:
     events: list[dict[str, Any]]
     shocks: list[float]
 
-    def __init__(self, measured: geometry.Recording, lag: int | None) -> None:
+    def __init__(
+        self, measured: geometry.Recording, lag: int | None, motion: geometry.WallMotion | None = None
+    ) -> None:
         self.measured = measured
+        self._walls = None if motion is None else geometry.WallSampler(motion, min(measured.grid.spacing))
         self.lagged = None if lag is None else LaggedAnalyses(lag)
         self.fields, self.sigmas, self.missing, self.quality, self.events, self.shocks = [], [], [], [], [], []
 
@@ -122,7 +128,15 @@ class Analyses:
 
     def _clean(self, control: Tensor, frame: int) -> Tensor:
         mask = np.array(self.measured.mask[frame], bool)
-        found = without_divergence(control.numpy(), mask, self.measured.grid.spacing)
+        found = without_divergence(self._balanced(control.numpy(), mask, frame), mask, self.measured.grid.spacing)
         if not found.converged:
             self.happened(frame, divergence_left=found.left)
         return torch.from_numpy(found.velocity).to(torch.float32)
+
+    def _balanced(self, control: np.ndarray, mask: np.ndarray, frame: int) -> np.ndarray:
+        """The field nearest to the control's that passes through every cross-section what the walls displace."""
+        if self._walls is None or not mask.any():
+            return control
+        time = float(self.measured.time[frame])
+        balance = MassBalance(self.measured.grid, mask, self._walls.at(time), open_regions(self.measured, time))
+        return balance.nearest(control).astype(control.dtype)

@@ -66,7 +66,8 @@ class Cycle:
         self.measured, self.grid = measurements[0].recording, measurements[0].grid
         self.splines = measurements[0].prepared.splines
         self.generator = torch.Generator().manual_seed(seed)
-        self.analyses = Analyses(self.measured, options.lag)
+        believed = None if self.splines.estimates.contradicted else self.splines.motion
+        self.analyses = Analyses(self.measured, options.lag, believed)
         self.analyser = Analyser(
             self.measurements, filter_, options, self.generator, self.analyses, truth=truth, seed=seed
         )
