@@ -46,7 +46,7 @@ def test_one_observation_moves_the_analysis_there_and_says_so(
 
     What gives an analysis its balance of mass and frees it of divergence reaches everywhere: it is left out here.
     """
-    monkeypatch.setattr("torchsph.methods.ensemble.analyses.Analyses._balanced", lambda self, field, *_: field)
+    monkeypatch.setattr(PreparedMeasurement, "balance", None)
     monkeypatch.setattr(
         "torchsph.methods.ensemble.analyses.without_divergence", lambda field, *_: Cleaned(field, 0.0, True)
     )

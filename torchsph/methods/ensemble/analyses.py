@@ -11,9 +11,8 @@ from torch import Tensor
 
 import geometry
 from torchsph.assimilation import Analysis
-from torchsph.haemodynamics.fields.continuity import MassBalance
 
-from ..measurement.wall_rows import open_regions
+from ..measurement.wall_balance import WallBalance
 from .divergence_cleaning import without_divergence
 from .forecaster import Ensemble
 from .lagged import Lagged, LaggedAnalyses
@@ -25,7 +24,7 @@ class Analyses:
     Args:
         measured: the recording whose frames they belong to.
         lag: cycles whose data still move an analysis, or None.
-        motion: of the walls whose balance of mass the fields keep; None: they keep their own.
+        balance: of mass between the walls, which the fields keep; None: they keep their own.
 
     Attributes:
         fields: (D, *shape) for each frame, m/s, of the walls' balance of mass and without divergence.
@@ -43,11 +42,8 @@ class Analyses:
     events: list[dict[str, Any]]
     shocks: list[float]
 
-    def __init__(
-        self, measured: geometry.Recording, lag: int | None, motion: geometry.WallMotion | None = None
-    ) -> None:
-        self.measured = measured
-        self._walls = None if motion is None else geometry.WallSampler(motion, min(measured.grid.spacing))
+    def __init__(self, measured: geometry.Recording, lag: int | None, balance: WallBalance | None = None) -> None:
+        self.measured, self.balance = measured, balance
         self.lagged = None if lag is None else LaggedAnalyses(lag)
         self.fields, self.sigmas, self.missing, self.quality, self.events, self.shocks = [], [], [], [], [], []
 
@@ -128,15 +124,8 @@ class Analyses:
 
     def _clean(self, control: Tensor, frame: int) -> Tensor:
         mask = np.array(self.measured.mask[frame], bool)
-        found = without_divergence(self._balanced(control.numpy(), mask, frame), mask, self.measured.grid.spacing)
+        field = control.numpy() if self.balance is None else self.balance.nearest(control.numpy(), frame)
+        found = without_divergence(field, mask, self.measured.grid.spacing)
         if not found.converged:
             self.happened(frame, divergence_left=found.left)
         return torch.from_numpy(found.velocity).to(torch.float32)
-
-    def _balanced(self, control: np.ndarray, mask: np.ndarray, frame: int) -> np.ndarray:
-        """The field nearest to the control's that passes through every cross-section what the walls displace."""
-        if self._walls is None or not mask.any():
-            return control
-        time = float(self.measured.time[frame])
-        balance = MassBalance(self.measured.grid, mask, self._walls.at(time), open_regions(self.measured, time))
-        return balance.nearest(control).astype(control.dtype)
