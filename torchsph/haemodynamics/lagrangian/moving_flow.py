@@ -82,7 +82,7 @@ class MovingFlow:
         return self.start + self.period if self.period else float(self.time[-1])
 
     def pieces(self, before: float, after: float) -> list[tuple[float, float, float]]:
-        """The way from one time to another, s, either way, cut at the frames: begin, end, and the highest speed, m/s."""
+        """The way between two times, s, cut at the frames: begin, end and the highest speed, m/s, of every piece."""
         low, high = min(before, after), max(before, after)
         frames = self.time
         if self.period:
