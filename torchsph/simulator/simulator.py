@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 import torch
 
+from geometry.arguments import checked
 from torchsph.pairs import choose_backend
 
 from .domain import Domain
@@ -19,6 +20,7 @@ from .state.particles import Particles
 from .state.units import Units
 
 
+@checked
 @dataclass(frozen=True)
 class Simulator:
     """A scene with the way to step it.
@@ -58,6 +60,7 @@ class Simulator:
         """Walls, valves and forces as particles see them; shared by all runs, and changed by none."""
         return self._domain
 
+    @checked
     def start(self, time: float, *, members: int = 1, seed: int = 0) -> Simulation:
         """A resting fluid at ``time`` (s): ``members`` copies of one seeding, drawn with ``seed``.
 
@@ -75,6 +78,7 @@ class Simulator:
             self._seeded[label] = single
         return self.resume(self._seeded[label].repeated(members), time)
 
+    @checked
     def resume(self, particles: Particles, time: float) -> Simulation:
         """Run on with particles in internal units that were made elsewhere.
 

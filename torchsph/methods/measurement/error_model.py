@@ -18,6 +18,7 @@ from scipy.ndimage import gaussian_filter
 from scipy.optimize import brentq
 
 import geometry
+from geometry.arguments import checked
 from torchsph.assimilation.diagnostics.scores import CHI2_MEDIAN
 
 from .frame_splines import FrameSmoother, node_weights
@@ -75,6 +76,7 @@ class ObservationError:
         return self.deviation[frame].reshape(shape) ** 2 * factor
 
 
+@checked
 def estimate_error(
     measured: geometry.Recording, splines: FrameSmoother, smoothed: geometry.Recording
 ) -> ObservationError:
