@@ -91,7 +91,7 @@ REFUSED: dict[str, tuple[Callable[[], object], str]] = {
     "factor of cells": (lambda: CellRows(KNOTS, CELLS, ONES, 3), r"it must be \(rows, 64\)"),
     "knots": (
         lambda: Knots((math.nan,) * 3, (0.005,) * 3, (2, 2, 2)),
-        "origin must be a sequence, each a number, got .nan",
+        "Knots: origin must be without NaN, got .nan",
     ),
     "many knots": (lambda: Knots((0.0,) * 3, (1e-9,) * 3, (10**4,) * 3), "than the .* that int32 can number"),
     "short band": (lambda: Factor(BAND[:5].clone(), ORDERING), "a row for each component of the"),

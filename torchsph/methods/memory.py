@@ -132,7 +132,7 @@ def predicted(
 
 
 def _splines(splines: FrameSmoother) -> tuple[int, int]:
-    """Bytes of bands and of rows, of the frame with the most nodes in its mask, by the knots and the band that its fit will have."""
+    """Bytes of bands and of rows: of the frame with the most nodes in its mask, by the knots that its fit will have."""
     recording = splines.recording
     frame = int(np.argmax(recording.mask.reshape(recording.frames, -1).sum(1)))
     inside = torch.from_numpy(np.array(recording.mask[frame], bool).reshape(-1))
