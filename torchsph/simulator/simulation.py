@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from geometry import Grid
+from geometry.arguments import checked
 from torchsph.pairs.moving_least_squares import Fetched
 
 from .advancing import AdvancingRun
@@ -85,6 +86,7 @@ class Simulation(AdvancingRun):
         self._stepper.pair_search.radius = self._stepper.support.radius
         self._stepper.pair_search.forget()
 
+    @checked
     def impose(self, grid: Grid, velocity: Tensor, mask: Tensor, confidence: Tensor | None = None) -> None:
         """Replace the particles' velocities by those of a grid at the present time.
 
@@ -121,6 +123,7 @@ class Simulation(AdvancingRun):
         """Whether ``project`` knows what the scene's walls ask for."""
         return self.domain.walls is None or self.domain.scheme.wall.complete
 
+    @checked
     def project(self, times: int = 1) -> Tensor:
         """Make the fluid's velocities free of divergence, as the walls and the flux of open valves ask for.
 
@@ -144,6 +147,7 @@ class Simulation(AdvancingRun):
         )
         return (taken / left.clamp_min(torch.finfo(left.dtype).tiny)).sqrt()
 
+    @checked
     def pull(self, grid: Grid, target: Tensor, gain: Tensor, weight: Tensor) -> None:
         """Pull the particles' velocities towards a measured grid.
 
@@ -169,6 +173,7 @@ class Simulation(AdvancingRun):
         moved = pulled(points, p.velocity * self.units.speed, grid, target, gain, weight) / self.units.speed
         self.particles = p.changed(velocity=torch.where(p.inside[:, None], moved, p.velocity))
 
+    @checked
     def fetch(self, grid: Grid, mask: Tensor) -> Fetched:
         """Velocities at the nodes where ``mask`` (*shape): value (members, D, *shape), covered (members, *shape).
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 import torch
 
+from geometry.arguments import checked
 from torchsph.pairs import choose_backend
 from torchsph.pairs.backends.differentiable import DifferentiableBackend
 
@@ -20,6 +21,7 @@ from .state.particles import Particles
 from .state.units import Units
 
 
+@checked
 @dataclass(frozen=True)
 class Simulator:
     """A scene with the way to step it.
@@ -63,6 +65,7 @@ class Simulator:
         """Walls, valves and forces as particles see them; shared by all runs, and changed by none."""
         return self._domain
 
+    @checked
     def start(self, time: float, *, members: int = 1, seed: int = 0) -> Simulation:
         """A resting fluid at ``time`` (s): ``members`` copies of one seeding, drawn with ``seed``.
 
@@ -80,6 +83,7 @@ class Simulator:
             self._seeded[label] = single
         return self.resume(self._seeded[label].repeated(members), time)
 
+    @checked
     def resume(self, particles: Particles, time: float) -> Simulation:
         """Run on with particles in internal units that were made elsewhere.
 

@@ -16,6 +16,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 import geometry
+from geometry.arguments import checked
 
 from .frame_splines import FrameSmoother, node_weights
 from .kernel_width import FWHM, behind_splines, kernel_width
@@ -68,6 +69,7 @@ class ObservationError:
         return self.deviation[frame].reshape(shape) ** 2 * factor
 
 
+@checked
 def estimate_error(
     measured: geometry.Recording, splines: FrameSmoother, smoothed: geometry.Recording
 ) -> ObservationError:
