@@ -93,15 +93,18 @@ class Material:
             return geometry.read_recording(str(file))
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # the thesis preset loses volume; its numbers say how much
-            found = self._analysed(method)
+            found = self._analysed(method, None if file is None else file.with_suffix(".pt"))
         if file is not None:
             file.parent.mkdir(parents=True, exist_ok=True)
             geometry.write_recording(str(file), found)
         return found
 
-    def _analysed(self, method: str) -> geometry.Recording:
+    def _analysed(self, method: str, checkpoint: Path | None) -> geometry.Recording:
+        """The command line's own settings, but for the thesis's; a run that was cut off goes on from ``checkpoint``."""
         measured = self.measured
-        spacing = (2.5 if self.fast else 1.6) * 1e-3
+        spacing = (2.5 if self.fast else 2.0) * 1e-3
+        if checkpoint is not None:
+            checkpoint.parent.mkdir(parents=True, exist_ok=True)
         if method == "spline, thesis":
             nodes = (12, 8, 8) if self.fast else (32, 16, 16)
             return ts.smooth(measured, regularize.Smoother.preset("thesis", nodes=nodes))
@@ -111,9 +114,9 @@ class Material:
             model = ts.Simulator(ts.Scene.from_recording(measured, spacing), ts.preset("thesis"))
             return ts.filter_sph(measured, model, seed=self.seed).recording
         if method == "ensemble, default":
-            scene = ts.Scene.from_recording(measured, spacing if self.fast else 2e-3)
-            model = ts.Simulator(scene, ts.preset("default"))
-            return ts.assimilate(measured, model, members=4 if self.fast else 16, seed=self.seed).recording
+            few = {"spacing": 4e-3, "members": 4} if self.fast else {}
+            kept = {} if checkpoint is None else {"checkpoints": checkpoint, "resume": True}
+            return ts.run_methods(measured, ("ensemble",), seed=self.seed, **few, **kept)["ensemble"].recording
         raise ValueError(f"unknown method '{method}'")
 
     def _file(self, name: str) -> Path:

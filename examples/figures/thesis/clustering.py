@@ -1,4 +1,4 @@
-"""Particles during filling with the thesis's settings, with single cures, and as they are now (Grønli 2017, fig. 5.1)."""
+"""Particles during filling with the thesis's settings, with cures, and as they are now (Grønli 2017, fig. 5.1)."""
 
 from __future__ import annotations
 
@@ -47,8 +47,8 @@ def make(material: Material) -> Result:
         Claim(
             "particles cluster under high pressure during filling",
             worst["nearest_neighbour_p05"] < 0.6 * cured["nearest_neighbour_p05"],
-            f"a twentieth of the particles is nearer than {worst['nearest_neighbour_p05']:.2f} spacings to another with "
-            f"the thesis's settings, {cured['nearest_neighbour_p05']:.2f} now",
+            f"a twentieth of the particles is nearer than {worst['nearest_neighbour_p05']:.2f} spacings to another "
+            f"with the thesis's settings, {cured['nearest_neighbour_p05']:.2f} now",
         ),
         Claim(
             "velocities cannot be fetched where support is missing (vacuum near the inlet, clusters)",

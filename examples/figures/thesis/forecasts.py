@@ -24,8 +24,8 @@ def make(material: Material) -> Result:
     """NRMSE of each preset over frame rate, and error over time; persistence beside them."""
     truth = material.truth
     rates = RATES[1:3] if material.fast else RATES
-    spacing = (2.5 if material.fast else 1.6) * 1e-3
-    starts = {"every": truth.frames} if material.fast else {"every": 4}
+    spacing = (2.5 if material.fast else 1.8) * 1e-3
+    starts = {"every": truth.frames} if material.fast else {"every": 6}
     numbers: dict[str, dict] = {"nrmse": {}, "over_time": {}, "persistence": {}, "failed_starts": {}}
     for preset in ("thesis", "default"):
         for case, valves in CASES.items():

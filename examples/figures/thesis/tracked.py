@@ -19,11 +19,11 @@ from ..style import planes, sequence
 def make(material: Material) -> Result:
     """Track a few frames of the truth; errors where estimates were accepted, and how far they are to be trusted."""
     truth = material.truth
-    frames = [truth.frames // 2] if material.fast else material.frames_every(0.05, 9)
+    frames = [truth.frames // 2] if material.fast else material.frames_every(0.075, 6)
     part = truth.select(np.array(frames))
     if material.fast:
         part = _coarser(part)
-    options = SpeckleOptions(every=1, training=4 if material.fast else 48)
+    options = SpeckleOptions(every=1, training=4 if material.fast else 24)
     found = measure_speckle(part, options, material.seed)
     mask, true = np.asarray(part.mask, bool), np.asarray(part.velocity)
     kept = mask & (np.asarray(found.weight) > 0)

@@ -55,8 +55,8 @@ def make(material: Material) -> Result:
         Claim(
             "particles do not pass the valves in sufficient number (no reseeding, vacuum near the inlet)",
             numbers["volume_error"]["thesis"] > 0.5,
-            f"the volume that has passed the valves differs from that of the walls by {lost['thesis']:.2f} of its RMS with "
-            f"the thesis's sources, by {lost['default']:.2f} with reservoirs",
+            f"the volume that has passed the valves differs from that of the walls by {lost['thesis']:.2f} of its RMS "
+            f"with the thesis's sources, by {lost['default']:.2f} with reservoirs",
         ),
     ]
 

@@ -37,7 +37,7 @@ def scene(spacing: float) -> ts.Scene:
 
 
 def schemes(speed: float, stiffness: float) -> dict[str, ts.WeaklyCompressible]:
-    """The thesis's physics with its potential walls, and complete kernels; both ``stiffness`` times as fast as the fluid."""
+    """The thesis's physics with its potential walls, and complete kernels; sound ``stiffness`` times the speed."""
     thesis = ts.preset("thesis", sound_speed=stiffness * speed, steps_per_frame=None, background_pressure=0.0)
     own = ts.WeaklyCompressible(**(FREE_SURFACE_OPTIONS | {"sound_speed": stiffness * speed}))
     return {"thesis": thesis, "default": own}
