@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
@@ -35,6 +35,7 @@ class Material:
     seed: int = 0
     data: Path = ROOT.parent / "shared" / "data"
     kept: Path | None = None
+    _made: dict[str, geometry.Recording] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def settings(self, **more: object) -> dict[str, object]:
         """What goes into a figure's JSON."""
@@ -85,19 +86,21 @@ class Material:
         Raises:
             ValueError: an unknown method.
         """
+        if method in self._made:
+            return self._made[method]
         # what can change an analysis: every room that it runs through
         rooms = ("geometry", "regularize", "torchsph/simulator", "torchsph/pairs", "torchsph/methods")
         name = f"{method.replace(', ', '-')}-{self.seed}-{code_hash(rooms)}.h5"
         file = None if self.kept is None or self.fast else self.kept / name
         if file is not None and file.is_file():
-            return geometry.read_recording(str(file))
+            return self._made.setdefault(method, geometry.read_recording(str(file)))
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # the thesis preset loses volume; its numbers say how much
             found = self._analysed(method, None if file is None else file.with_suffix(".pt"))
         if file is not None:
             file.parent.mkdir(parents=True, exist_ok=True)
             geometry.write_recording(str(file), found)
-        return found
+        return self._made.setdefault(method, found)
 
     def _analysed(self, method: str, checkpoint: Path | None) -> geometry.Recording:
         """The command line's own settings, but for the thesis's; a run that was cut off goes on from ``checkpoint``."""

@@ -53,12 +53,18 @@ def tuned(rival: Rival, noise: str, true: geometry.Recording) -> dict[str, Any]:
     return {"settings": settings, "nrmse_when_tuned": error, "combinations": len(tried)}
 
 
-def judged(rival: Rival, settings: dict[str, Any], measured: geometry.Recording, truth: geometry.Recording) -> dict:
+def judged(
+    rival: Rival,
+    settings: dict[str, Any],
+    measured: geometry.Recording,
+    truth: geometry.Recording,
+    curves: dict[str, np.ndarray],
+) -> dict[str, Any]:
     """A row of the table: of the phantom, with settings that have never seen it."""
     began = time.process_time()
     velocity = rival.fit(measured, **rival.fixed, **settings)
     seconds = time.process_time() - began
-    row = scores(velocity, measured, truth, read_out(truth, FlowDomain.from_recording(truth)))
+    row = scores(velocity, measured, truth, curves)
     return row | {"seconds": round(seconds, 2), "settings": settings}
 
 
@@ -89,21 +95,21 @@ def main(arguments: list[str] | None = None) -> int:
     unknown = [name for name in options.names if name not in RIVALS]
     if unknown:
         parser.error(f"unknown rival '{unknown[0]}'; known: {', '.join(RIVALS)}")
-    table = load(options.table)
-    true = None
+    table, kept = load(options.table), options.table.parent / "kept"
+    curves: dict[str, np.ndarray] = {}
     for name in options.names or list(RIVALS):
         rival = RIVALS[name]
         for noise in options.noise:
             chosen = table["settings"].setdefault(name, {})
             if options.tune or noise not in chosen:
-                true = tuning.truth() if true is None else true
-                chosen[noise] = tuned(rival, noise, true)
+                chosen[noise] = tuned(rival, noise, tuning.kept_truth(kept))
                 store(options.table, table)
             if not options.again and name in table["rows"].get(noise, {}):
                 continue
             measured = geometry.read_recording(str(options.data / FILES[noise]))
             truth = at_times(geometry.read_recording(str(options.data / "lv_phantom_a.h5")), measured)
-            row = judged(rival, chosen[noise]["settings"], measured, truth)
+            curves = curves or read_out(truth, FlowDomain.from_recording(truth))
+            row = judged(rival, chosen[noise]["settings"], measured, truth, curves)
             table["rows"].setdefault(noise, {})[name] = row | {"from": provenance(SOURCES)}
             store(options.table, table)
             print(f"{name}, {noise}: {row['nrmse']:.3f}", file=sys.stderr)

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from .methods import gaussian, ivfm, leray, smoothn, temporal
+from .methods import gaussian, ivfm, leray, pinn, siren, smoothn, temporal
 
 
 @dataclass(frozen=True)
@@ -35,12 +35,12 @@ class Rival:
 
 RIVALS: dict[str, Rival] = {
     "gaussian": Rival(gaussian.fit, "common practice", {"fwhm": (3e-3, 4e-3, 5e-3, 6e-3), "power": (1.0, 2.0)}),
-    "smoothn": Rival(smoothn.fit, "Garcia 2010; PyMUST", {"strength": (None, 1.0, 4.0, 16.0), "power": (1.0, 2.0)}),
+    "smoothn": Rival(smoothn.fit, "Garcia 2010; PyMUST", {"strength": (None, 4.0), "power": (1.0, 2.0)}),
     "leray": Rival(leray.fit, "Helmholtz-Leray projection", {"fwhm": (2e-3, 3e-3, 4e-3, 5e-3), "power": (1.0, 2.0)}),
     "ivfm": Rival(
         ivfm.fit,
         "constrained least squares, after Vixege et al. 2021",
-        {"smoothness": (1.0, 2.0, 4.0), "divergence": (10.0,), "wall": (1.0, 3.0), "power": (1.0, 2.0)},
+        {"smoothness": (1.0, 2.0, 4.0), "divergence": (10.0,), "wall": (3.0,), "power": (1.0, 2.0)},
     ),
     "gaussian over time": Rival(
         temporal.fit,
@@ -57,7 +57,19 @@ RIVALS: dict[str, Rival] = {
     "ivfm over time": Rival(
         temporal.fit,
         "constrained least squares and a Gaussian over time",
-        {"width": (5e-3, 1e-2), "smoothness": (0.5, 1.0, 2.0), "divergence": (10.0,), "wall": (3.0,)},
+        {"width": (5e-3, 1e-2), "smoothness": (1.0, 2.0), "divergence": (10.0,), "wall": (3.0,)},
         {"on": ivfm.fit},
+    ),
+    "siren": Rival(
+        siren.fit,
+        "neural field as a curl, after DAF-FlowNet (arXiv 2604.00205)",
+        # of frequencies 2, 4, 8, 12 and walls 1, 0.1, on eight frames of the tuning ventricle
+        {"frequency": (8.0,), "wall": (0.1,)},
+    ),
+    "pinn": Rival(
+        pinn.fit,
+        "physics-informed network, after Ling et al. 2024",
+        # of frequencies 3, 5, 8, walls 1, 0.1 and masses 0.1, 0.01, likewise
+        {"frequency": (8.0,), "wall": (0.1,), "mass": (0.01,)},
     ),
 }

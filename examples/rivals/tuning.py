@@ -6,6 +6,7 @@ No measurement and no outside solver: our own simulation stands in for its blood
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -39,6 +40,15 @@ def truth(spacing: float = 2e-3, shape: geometry.Ventricle = SHAPE, grid_spacing
         run.advance(float(time))
         field[frame] = run.fetch(still.grid, torch.from_numpy(np.array(still.mask[frame], bool))).value[0].numpy()
     return replace(still, velocity=field).select(times > FIRST - 1e-6)
+
+
+def kept_truth(folder: Path) -> geometry.Recording:
+    """`truth` as a file of a folder, made where it is not there."""
+    file = folder / "tuning.h5"
+    if not file.is_file():
+        folder.mkdir(parents=True, exist_ok=True)
+        geometry.write_recording(str(file), truth())
+    return geometry.read_recording(str(file))
 
 
 def measurement(true: geometry.Recording, noise: str, seed: int = 977) -> geometry.Recording:
