@@ -12,14 +12,16 @@ from tqdm import tqdm
 
 from . import __doc__ as about
 from .material import Material
-from .record import ROOT, Claim, is_current, write
+from .record import ROOT, Claim, code_hash, is_current, write
 from .registry import FIGURES, Entry
 from .style import save
+from .table import page
 
 
 def draw(entry: Entry, material: Material, out: Path) -> list[Claim]:
     """Make one figure; its JSON is written last, so that a figure that has one is whole."""
     began = time.perf_counter()
+    material.begin(entry.name, code_hash(entry.sources))
     result = entry.make(material)
     save(result.draw(), out / f"{entry.name}.png")
     heading = {"figure": entry.name, "title": entry.title, "thesis": f"Grønli 2017, {entry.thesis}"}
@@ -54,6 +56,8 @@ def main(arguments: list[str] | None = None) -> int:
             continue
         for claim in draw(FIGURES[name], material, options.out):
             tqdm.write(f"{name}: {'seen' if claim.seen_here else 'not seen'}: {claim.number}", file=sys.stderr)
+    if not options.fast:
+        (options.out.parent / "README.md").write_text(page(options.out), encoding="utf-8")
     return 0
 
 

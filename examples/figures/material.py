@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import json
+import re
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
@@ -16,6 +20,7 @@ from torchsph.data import sample_measurement, sample_truth
 
 from .record import ROOT, code_hash
 
+Part = TypeVar("Part")
 PHANTOM, MEASUREMENTS = "lv_phantom_a.h5", {"measured": "lv_phantom_a_measured.h5", "noisy": "lv_phantom_a_noisy.h5"}
 FILLING = 0.26, 0.32  # s, what the fast variants take of the sample: the early wave
 
@@ -35,7 +40,26 @@ class Material:
     seed: int = 0
     data: Path = ROOT.parent / "shared" / "data"
     kept: Path | None = None
+    _now: list[str] = field(default_factory=list, init=False, repr=False, compare=False)
     _made: dict[str, geometry.Recording] = field(default_factory=dict, init=False, repr=False, compare=False)
+
+    def begin(self, figure: str, code: str) -> None:
+        """From now on parts belong to a figure, made by code of that hash."""
+        self._now[:] = [f"{figure}-{self.seed}-{code}"]
+
+    def part(self, key: str, compute: Callable[[], Part]) -> Part:
+        """A part of a figure that JSON can hold, kept as a file: a figure that was cut off goes on from there."""
+        if self.kept is None or self.fast or not self._now:
+            return compute()
+        file = self.kept / f"{self._now[0]}-{re.sub(r'[^A-Za-z0-9.]+', '_', key)}.json"
+        if not file.is_file():
+            found = compute()
+            file.parent.mkdir(parents=True, exist_ok=True)
+            half = file.with_suffix(".half")
+            half.write_text(json.dumps(found), encoding="utf-8")
+            half.replace(file)
+        read: Part = json.loads(file.read_text(encoding="utf-8"))
+        return read
 
     def settings(self, **more: object) -> dict[str, object]:
         """What goes into a figure's JSON."""

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 import warnings
+from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -29,20 +31,36 @@ def make(material: Material) -> Result:
     numbers: dict[str, dict] = {"nrmse": {}, "over_time": {}, "persistence": {}, "failed_starts": {}}
     for preset in ("thesis", "default"):
         for case, valves in CASES.items():
-            scene = material.scene(spacing)
-            scheme = ts.preset(preset) if valves else ts.preset(preset, valve=None)
-            model = ts.Simulator(scene if valves else replace(scene, valves=()), scheme)
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # of volume that shut valves cannot let through
-                found = ts.skill(truth, model, [1 / rate for rate in rates], save=True, seed=material.seed, **starts)
+
+            def forecast(preset: str = preset, valves: bool = valves) -> dict[str, Any]:
+                return _case(material, preset, valves, spacing, rates, starts)
+
             name = f"{preset}, {case}"
-            numbers["nrmse"][name] = [row["nrmse"]["model"] for row in found.leads]
-            numbers["persistence"] = [row["nrmse"]["persistence"] for row in found.leads]
-            numbers["failed_starts"][name] = len(found.failures)
-            numbers["over_time"][name] = {f"{rate} Hz": _over_time(found.recordings[1 / rate], truth) for rate in rates}
+            found = material.part(name, forecast)
+            numbers["persistence"] = found.pop("persistence")
+            for key, value in found.items():
+                numbers[key][name] = value
     numbers["rates_hz"] = list(rates)
     settings = material.settings(spacing_m=spacing, **starts)
     return Result(numbers, _claims(numbers), settings, lambda: _draw(numbers))
+
+
+def _case(
+    material: Material, preset: str, valves: bool, spacing: float, rates: Sequence[int], starts: dict[str, int]
+) -> dict[str, Any]:
+    """Errors of one preset with its valves, or with none."""
+    truth, scene = material.truth, material.scene(spacing)
+    scheme = ts.preset(preset) if valves else ts.preset(preset, valve=None)
+    model = ts.Simulator(scene if valves else replace(scene, valves=()), scheme)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of volume that shut valves cannot let through
+        found = ts.skill(truth, model, [1 / rate for rate in rates], save=True, seed=material.seed, **starts)
+    return {
+        "nrmse": [row["nrmse"]["model"] for row in found.leads],
+        "persistence": [row["nrmse"]["persistence"] for row in found.leads],
+        "failed_starts": len(found.failures),
+        "over_time": {f"{rate} Hz": _over_time(found.recordings[1 / rate], truth) for rate in rates},
+    }
 
 
 def _over_time(forecast: geometry.Recording, truth: geometry.Recording) -> dict[str, list[float]]:

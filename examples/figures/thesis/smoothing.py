@@ -8,6 +8,7 @@ what their kernels do by themselves: the same weights summed over a lattice so d
 from __future__ import annotations
 
 import math
+from itertools import product
 
 import numpy as np
 import torch
@@ -40,20 +41,29 @@ def make(material: Material) -> Result:
     frames = np.array([truth.frames - 1]) if material.fast else np.arange(0, truth.frames, 16)
     part = truth.select(frames)
     mask, true = np.asarray(part.mask, bool), np.nan_to_num(part.velocity)
-    passed = {
-        preset: [particle_errors(material, part.time, spacing, preset) for spacing in spacings]
-        for preset in ("thesis", "default")
-    }
-    particles = {preset: [_summary(*one) for one in found] for preset, found in passed.items()}
+    particles: dict[str, list[dict[str, float]]] = {"thesis": [], "default": []}
+    kernels = []
     middle = len(frames) // 2
-    kernels = [
-        _kernel_alone(material, int(frames[middle]), fetched[middle], known[middle], spacing)
-        for spacing, (fetched, _, known, _) in zip(spacings, passed["default"], strict=True)
-    ]
-    splines = {
-        name: [_summary(spline_fields(material, part.time, one, options), true, mask) for one in nodes]
-        for name, options in (("exact solver", {}), ("loose LSQR", LOOSE))
-    }
+    for preset, spacing in product(particles, spacings):
+
+        def passed(preset: str = preset, spacing: float = spacing) -> list[dict[str, float]]:
+            fetched, exact, known, count = particle_errors(material, part.time, spacing, preset)
+            alone = _kernel_alone(material, int(frames[middle]), fetched[middle], known[middle], spacing)
+            return [_summary(fetched, exact, known, count), alone]
+
+        whole, alone = material.part(f"{preset} {spacing}", passed)
+        particles[preset].append(whole)
+        if preset == "default":
+            kernels.append(alone)
+    splines: dict[str, list[dict[str, float]]] = {"exact solver": [], "loose LSQR": []}
+    for name, one in product(splines, nodes):
+
+        def fitted(
+            one: tuple[int, int, int] = one, options: dict = LOOSE if "LSQR" in name else {}
+        ) -> dict[str, float]:
+            return _summary(spline_fields(material, part.time, one, options), true, mask)
+
+        splines[name].append(material.part(f"{name} {one}", fitted))
     numbers = {
         "spacing_m": list(spacings),
         "particles": [int(row["particles"]) for row in particles["default"]],

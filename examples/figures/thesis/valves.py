@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import warnings
+from functools import partial
 
 import numpy as np
 import torch
@@ -30,7 +31,9 @@ def make(material: Material) -> Result:
     walls = models["default"].scene.walls
     assert walls is not None
     asked = np.array([walls.volume_rate(float(t)) for t in 0.5 * (times[1:] + times[:-1])])
-    flows = {name: _flow(model, material, times) for name, model in models.items()}
+    flows = {
+        name: np.array(material.part(name, partial(_flow, model, material, times))) for name, model in models.items()
+    }
     steps = np.diff(times)
     total = np.cumsum(asked * steps)
     numbers = {
@@ -66,7 +69,7 @@ def make(material: Material) -> Result:
     return Result(numbers, claims, material.settings(spacing_m=scene.spacing), draw)
 
 
-def _flow(model: ts.Simulator, material: Material, times: np.ndarray) -> np.ndarray:
+def _flow(model: ts.Simulator, material: Material, times: np.ndarray) -> list[float]:
     """Net flow into the cavity between times, m^3/s, of a run that starts with the true field."""
     truth = material.truth
     first = int(np.abs(truth.time - times[0]).argmin())
@@ -81,7 +84,7 @@ def _flow(model: ts.Simulator, material: Material, times: np.ndarray) -> np.ndar
         for time in times[1:]:
             run.advance(float(time))
             passed.append(float((run.record.inflow - run.record.outflow).sum()))
-    return np.diff(passed) / np.diff(times)
+    return (np.diff(passed) / np.diff(times)).tolist()
 
 
 def _source_pressure(model: ts.Simulator, times: np.ndarray) -> dict[str, list[float]]:

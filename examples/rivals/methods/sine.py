@@ -1,4 +1,4 @@
-"""What the neural fields share: a sine network with its derivatives, samples in units of the flow, windows of frames."""
+"""What the neural fields share: a sine network with its derivatives, samples in the flow's units, windows of frames."""
 
 from __future__ import annotations
 
@@ -53,8 +53,8 @@ class SineField(nn.Module):
 class Samples:
     """A window of a measurement in units of its own: places and times (n, 4), velocities (n, 3), weights (n,).
 
-    ``wall``, ``normal``, ``moving``: places (k, 4), normals (k, 3) and normal velocities (k,) of walls, at which nothing
-    goes through. ``length`` m, ``duration`` s and ``speed`` m/s are the units.
+    ``wall``, ``normal``, ``moving``: places (k, 4), normals (k, 3) and normal velocities (k,) of walls, through which
+    nothing goes. ``length`` m, ``duration`` s and ``speed`` m/s are the units.
     """
 
     places: Tensor

@@ -1,6 +1,6 @@
 """A velocity field as the curl of a sine network, free of divergence by construction, closed at the walls.
 
-The idea of DAF-FlowNet (arXiv 2604.00205) and of the neural fields of Saitta et al. (2024), fitted to windows of frames.
+The idea of DAF-FlowNet (arXiv 2604.00205) and of the neural fields of Saitta et al. (2024), on windows of frames.
 """
 
 from __future__ import annotations
