@@ -27,6 +27,7 @@ matplotlib.use("Agg")
 import torch
 from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
+from matplotlib.ticker import NullFormatter
 
 import geometry
 import torchsph as ts
@@ -130,11 +131,12 @@ def panel(axis: Axes, points: list[Point], title: str, label: str) -> None:
     best = front(points)
     axis.step([p.seconds for p in best], [p.error for p in best], "k-", where="post", linewidth=0.8, zorder=0)
     for point in points if len(points) < 16 else best:
-        axis.annotate(point.name, (point.seconds, point.error), (4, 3), textcoords="offset points", fontsize=6.5)
+        axis.annotate(point.name, (point.seconds, point.error), (4, 3), textcoords="offset points", fontsize=7)
     axis.set(xscale="log", xlabel="seconds", ylabel=label, title=title)
-    axis.margins(x=0.18)
+    axis.margins(x=0.25, y=0.1)
+    axis.xaxis.set_minor_formatter(NullFormatter())
     axis.grid(which="both", alpha=0.25)
-    axis.legend(fontsize=6.5, loc="upper right")
+    axis.legend(fontsize=7, framealpha=0.5)
 
 
 def inputs_hash() -> str:
@@ -154,10 +156,10 @@ def main() -> None:
     torch.set_num_threads(1)
     if options.measure:
         measure()
-    figure, axes = plt.subplots(1, 3, figsize=(14, 4.4), layout="constrained")
+    figure, axes = plt.subplots(1, 3, figsize=(14, 5), layout="constrained")
     panel(axes[0], forecasts(), "forecasts 10 to 40 ms ahead, sample", "error / error of persistence")
     for axis, noise in zip(axes[1:], ("measured", "noisy"), strict=True):
-        panel(axis, analyses(noise), f"analyses of a beat, {noise} phantom (44 frames)", "error / RMS speed")
+        panel(axis, analyses(noise), f"analyses of 44 frames, {noise} phantom", "error / RMS speed")
     figure.savefig(options.out, dpi=85, metadata={"Comment": inputs_hash()})
     names = {"forecast": forecasts(), "measured": analyses("measured"), "noisy": analyses("noisy")}
     for panel_name, points in names.items():
