@@ -17,7 +17,7 @@ ROOT = Path(__file__).resolve().parents[3]
 # files with tests that take a GPU where there is one
 ON_DEVICE = (
     "tests/torchsph/pairs/test_triton.py",
-    "tests/torchsph/device/test_on_device.py",
+    "tests/torchsph/device/test_pretended.py",
     "tests/regularize/solvers/test_triton.py",
 )
 

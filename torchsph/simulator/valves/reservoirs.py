@@ -204,29 +204,37 @@ class Reservoirs(ValveModel):
         """The same for members that see the same planes."""
         kind, gone = particles.kind, torch.zeros_like(particles.fluid)
         fresh: list[Particles] = []
+        renumbered = False
         for number, plane in self.openings.active(clock):
             height, lead = plane.height(particles.position), self._lead(number, clock, particles.members)
             lead = lead[particles.member] if isinstance(lead, Tensor) else torch.full_like(height, lead)
             buffer, channel = RESERVOIR + number, CHANNEL - number
             entered = ((kind == buffer) | (kind == channel)) & (height < 0.0)
             fed = entered & (kind == buffer)
-            if bool(fed.any()):
-                copy = particles.select(fed)
-                fresh.append(copy.changed(position=copy.position + (self._far - lead[fed])[:, None] * plane.normal))
             out = self._left(kind, height, plane, particles)
             beyond = ((kind == buffer) | (kind == channel) | out) & ~entered
-            turned = lead == 0.0
-            if bool((beyond & turned & (kind == channel)).any()):
+            turned = beyond & (lead == 0.0)
+            gone_here, odd = beyond & (height > self._far), turned & (kind == channel)
+            # one look at the device for all that may have happened here
+            any_fed, any_odd, any_entered, any_out, any_gone = torch.stack(
+                [some.any() for some in (fed, odd, entered, out, gone_here)]
+            ).tolist()
+            if any_fed:
+                copy = particles.select(fed)
+                fresh.append(copy.changed(position=copy.position + (self._far - lead[fed])[:, None] * plane.normal))
+            if any_odd:
                 # what drifted freely behind an outlet is no profile for the inlet that it has turned into
-                inlet = beyond & turned & self._of_members_with(beyond & turned & (kind == channel), particles)
+                inlet = turned & self._of_members_with(odd, particles)
                 velocity = torch.where(inlet[:, None], plane.velocity, particles.velocity)
                 particles = particles.changed(velocity=velocity)
             kind = torch.where(beyond, torch.where(height < lead, channel, buffer), kind)
             kind = torch.where(entered, torch.full_like(kind, FLUID), kind)
-            gone |= beyond & (height > self._far)
-            self._account(particles, entered, out, number, plane, record, pressure)
+            if any_gone:
+                gone, renumbered = gone | gone_here, True
+            passed = (entered if any_entered else None, out if any_out else None)
+            self._account(particles, *passed, number, plane, record, pressure)
         particles = particles.changed(kind=kind)
-        if not fresh and not bool(gone.any()):
+        if not fresh and not renumbered:
             return particles, False
         particles = particles.select(~gone)
         for copy in fresh:
@@ -241,23 +249,23 @@ class Reservoirs(ValveModel):
     def _account(
         self,
         particles: Particles,
-        entered: Tensor,
-        left: Tensor,
+        entered: Tensor | None,
+        left: Tensor | None,
         number: int,
         plane: OpeningPlane,
         record: Record,
         pressure: Pressure,
     ) -> None:
-        """Note the particles that have ``entered`` and ``left``, (N,) bool, through an opening."""
+        """Note the particles that have ``entered`` and ``left``, (N,) bool, through an opening; None: none."""
         valve = self.openings.valve_of[number]
-        if bool(entered.any()):
+        if entered is not None:
             some = particles.select(entered)
             level = pressure(some)
             if particles.pressure is not None and number not in self.openings.given:
                 # buffers of the incompressible scheme have none
                 level = mean_near(particles, plane, pressure(particles)).index_select(0, some.member)
             note_passed(record, some, valve, level, self.units, self._density, entered=True)
-        if bool(left.any()):
+        if left is not None:
             some = particles.select(left)
             note_passed(record, some, valve, pressure(some), self.units, self._density, entered=False)
 
