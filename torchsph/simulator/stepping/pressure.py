@@ -249,7 +249,7 @@ class Neighbourhood:
         """Minus the gradient (N, D) of ``potential`` (N,), complete at walls, 0 in reservoirs."""
         p = self.particles
         # buffers take no part: the gradient by differences then continues the fluid's own pressure into them
-        mass = p.mass if bool(coupled.all()) else torch.where(coupled, p.mass, torch.zeros_like(p.mass))
+        mass = torch.where(coupled, p.mass, torch.zeros_like(p.mass))
         terms = MomentumTerms(pressure="difference")
         slope = self.search.backend.momentum(self.pairs, p.changed(mass=mass).state(potential), self.support, terms)
         slope = slope if self.completeness is None else slope / self.completeness[:, None]
