@@ -182,8 +182,8 @@ def _is_plain(value: np.ndarray | torch.Tensor) -> bool:
 def _holds_nan(value: Any) -> bool:
     """Whether there is a NaN among numbers in tuples and lists."""
     if isinstance(value, tuple | list):
-        return any(_holds_nan(part) if isinstance(part, tuple | list) else part != part for part in value)
-    return False
+        return any(map(_holds_nan, value))
+    return isinstance(value, float) and math.isnan(value)
 
 
 def _is_among(value: Any, allowed: tuple[Any, ...]) -> bool:
