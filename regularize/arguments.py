@@ -233,7 +233,7 @@ class _Check:
             endless = self.rule is not None and self.rule.endless and not math.isnan(found)
             if not endless and not (isinstance(self.default, float) and str(self.default) == str(found)):
                 raise WrongValue(self._words("finite", value))
-        if _holds_nan(found):
+        if isinstance(found, tuple | list) and _holds_nan(found):
             raise WrongValue(self._words("without NaN", value))
         if self.rule is not None and found is not None and not self.rule.fits(found):
             raise WrongValue(self._words(self.rule.words, found))
