@@ -11,6 +11,8 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
+from geometry.arguments import checked
+
 from .errors import RecordingError
 from .field_checks import axis_order, wrapped_speeds
 from .finding import Finding
@@ -28,6 +30,7 @@ SENSELESS = 1e3  # m/s
 CLOSED = 0.5  # share of measured nodes without any motion, above which it is told
 
 
+@checked
 def findings(recording: Recording, *, severe_only: bool = False) -> list[Finding]:
     """All that is odd about a recording, the severe findings first.
 

@@ -7,6 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
+from geometry.arguments import ENDLESS, checked, finite
+
 from .integers import region_number
 from .overlap import refuse_overlaps, united
 from .readers.obj import read_obj
@@ -30,6 +32,7 @@ SHEETS = ("", "inner", "all")
 LARGEST = 1.0  # m; hearts are smaller, so a larger surface is in mm or cm
 
 
+@checked
 def read_surface(
     path: str | Path,
     *,
@@ -86,6 +89,7 @@ def read_surface(
         raise SurfaceError(f"{path}: {fault}") from fault
 
 
+@checked
 def write_surface(path: str | Path, surface: Surface, *, scale: float = 1.0) -> None:
     """Write a 3-D surface as STL, OBJ or PLY by suffix, in units of `scale` (m); PLY keeps the regions."""
     path = Path(path)
@@ -96,6 +100,7 @@ def write_surface(path: str | Path, surface: Surface, *, scale: float = 1.0) -> 
     mesh.export(path, file_type=path.suffix.lower()[1:])
 
 
+@checked(centre=finite(), radius=ENDLESS, normal=finite())
 def labelled(
     surface: Surface, region: int, *, centre: np.ndarray, radius: float, normal: np.ndarray | None = None
 ) -> Surface:
