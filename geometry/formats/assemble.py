@@ -276,7 +276,7 @@ def _scalar(
         )
     if size.get("t", 1) not in (1, frames):
         raise FormatError(f"{source.path}: {name} has {size['t']} frames, the velocity {frames}")
-    result = np.empty((frames, *(counts[lie.order[axis]] for axis in reversed(range(len(counts))))), kind)
+    result: np.ndarray = np.empty((frames, *(counts[lie.order[axis]] for axis in reversed(range(len(counts))))), kind)
     fill_scalar(result, source.arrays[name], letters, source.attributes.get(name, {}), lie, made)
     return result
 

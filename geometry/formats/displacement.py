@@ -101,7 +101,7 @@ def read_displacements(options: MotionOptions, vertices: np.ndarray, wall_unit: 
             return _by_vertices(source, names[0], vertices, unit, said)
     finally:
         source.close()
-    said = replace(said, velocity_unit=repr(unit), **({} if timed else {"interval": 1.0}))
+    said = replace(said, velocity_unit=repr(unit), interval=said.interval if timed else 1.0)
     fields = read_fields(paths, said, "")
     if fields.grid.dimension != 3:
         raise FormatError(f"{paths[0]}: displacements must have three components on a grid of three axes")
@@ -134,7 +134,7 @@ def _by_vertices(source: Source, name: str, vertices: np.ndarray, unit: float, s
     values = unit * np.transpose(values, [*times, order[0], components[0]]).reshape(-1, len(vertices), 3)
     if not np.isfinite(values).all():
         raise FormatError(f"{source.path}: {name}: must be finite for every vertex")
-    time = None
+    time: np.ndarray | None = None
     if isinstance(said.time, str) and said.time in source.arrays:
         time = np.asarray(source.arrays[said.time][(...,)], np.float64).reshape(-1) * (said.unit("time") or 1.0)
     elif isinstance(said.time, tuple) and said.time:

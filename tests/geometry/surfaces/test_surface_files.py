@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from geometry import Surface, SurfaceError, box, read_surface, write_surface
+from geometry.formats import FieldMap, convert
 
 BOX = box((0, 0, 0), (0.02, 0.02, 0.02), 0.01)
 VOLUME = 8e-6
@@ -255,6 +256,7 @@ def test_vtp_in_every_encoding(tmp_path: Path, mode: str, packed: str | None) ->
     from vtkmodules.util.numpy_support import numpy_to_vtk
     from vtkmodules.vtkCommonCore import vtkPoints
     from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkPolyData
+    from vtkmodules.vtkIOLegacy import vtkPolyDataWriter
     from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter
 
     points, strips, mesh = vtkPoints(), vtkCellArray(), vtkPolyData()
@@ -270,3 +272,11 @@ def test_vtp_in_every_encoding(tmp_path: Path, mode: str, packed: str | None) ->
     getattr(writer, f"SetCompressorTypeTo{packed}")()
     writer.Write()
     assert read_surface(tmp_path / "box.vtp").volume == pytest.approx(VOLUME, rel=1e-6)
+    legacy = vtkPolyDataWriter()
+    legacy.SetFileName(str(tmp_path / "box.vtk"))
+    legacy.SetInputData(mesh)
+    (legacy.SetFileTypeToASCII if mode == "Ascii" else legacy.SetFileTypeToBinary)()
+    legacy.Write()
+    assert read_surface(tmp_path / "box.vtk").volume == pytest.approx(VOLUME, rel=1e-6)
+    found = convert([tmp_path / "box.vtk"], FieldMap(grid_spacing=0.005)).recording
+    assert found.wall.at(0).volume == pytest.approx(VOLUME, rel=1e-6)
