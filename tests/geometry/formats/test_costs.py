@@ -107,7 +107,8 @@ def _zarr(recording: Recording, folder: Path) -> list[Path]:
     pytest.importorskip("zarr", reason=MISSING)
     pytest.importorskip("xarray", reason=MISSING)
     dataset = to_xarray(recording)[["velocity", "mask"]]
-    dataset.drop_vars("component").to_zarr(folder / "v.zarr")
+    pieces = {name: {"chunks": (1, *dataset[name].shape[1:])} for name in ("velocity", "mask")}
+    dataset.drop_vars("component").to_zarr(folder / "v.zarr", encoding=pieces, consolidated=False)
     return [folder / "v.zarr"]
 
 
