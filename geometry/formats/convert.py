@@ -108,7 +108,7 @@ def convert(
     text_of = description or f"converted from {paths[0].name}" + (
         f" and {len(paths) - 1} more" if len(paths) > 1 else ""
     )
-    if not format and all(holds_surface(path) for path in paths if path.is_file()):
+    if not format and all(path.is_file() and holds_surface(path) for path in paths):
         return _walls_alone(paths, said, wall, about, text_of)
     if len(paths) == 1 and not format and _is_recording(paths[0]):
         return Converted(read_recording(paths[0]))
