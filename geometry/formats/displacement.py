@@ -7,7 +7,7 @@ in time. A vertex outside of the field, or beside a node without a value, is ref
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -32,7 +32,8 @@ class MotionOptions:
     Attributes:
         files: one, or one for each frame in order of time; none: the wall does not move by displacements.
         said: the field map of the files, in which `velocity` names the displacements.
-        unit: of the displacements, a name or a number of metres; "": that of the file's lengths, else the wall's.
+        unit: of the displacements, a name or a number of metres; "": what their attribute `units` says, else that of
+            the file's lengths, else the wall's.
     """
 
     files: tuple[str, ...] = ()
@@ -95,7 +96,7 @@ def read_displacements(options: MotionOptions, vertices: np.ndarray, wall_unit: 
     source = open_source(paths[0], said)
     names = tuple(said.velocity) or tuple(source.roles.get("velocity", ()))
     try:
-        unit = factor(options.unit, "length") if options.unit else said.unit("length") or source.length or wall_unit
+        unit = _unit(options, source, names, wall_unit)
         timed = source.time is not None or bool(said.time) or said.interval is not None or said.period > 0
         if len(paths) == 1 and len(names) == 1 and _of_vertices(source, names[0], len(vertices)):
             return _by_vertices(source, names[0], vertices, unit, said)
@@ -110,6 +111,19 @@ def read_displacements(options: MotionOptions, vertices: np.ndarray, wall_unit: 
         fields.time if timed else None,
         len(fields.time),
     )
+
+
+def _unit(options: MotionOptions, source: Source, names: Sequence[str], wall_unit: float) -> float:
+    """Metres per unit of the displacements: as said, as their attribute `units` says, as of the lengths beside them."""
+    if options.unit:
+        return factor(options.unit, "length")
+    stated = source.attributes.get(names[0], {}).get("units") if names else None
+    if stated is None or not str(stated).strip():
+        return options.said.unit("length") or source.length or wall_unit
+    try:
+        return factor(stated.decode() if isinstance(stated, bytes) else str(stated), "length")
+    except ValueError as fault:
+        raise FormatError(f"{source.path}: {names[0]}: its attribute units: {fault} (--motion-unit)") from fault
 
 
 def _of_vertices(source: Source, name: str, count: int) -> bool:
