@@ -15,9 +15,10 @@ if str(ROOT) not in sys.path:
 
 import geometry
 from examples.rivals.frames import confidence, divergence_rows, laplacian_rows, wall_rows
-from examples.rivals.methods import gaussian, ivfm, leray, pinn, siren, smoothn, temporal
+from examples.rivals.methods import denoiser, gaussian, ivfm, leray, pinn, siren, smoothn, temporal
 from examples.rivals.methods.sine import Samples, SineField
 from examples.rivals.registry import RIVALS
+from torchsph.ultrasound import NoiseModel, measure_noise
 
 TABLE = ROOT / "examples" / "rivals" / "results" / "rivals.json"
 
@@ -151,6 +152,19 @@ def test_momentum_of_a_solid_rotation_is_balanced_by_its_pressure():
     assert mass < 1e-12 and momentum < 1e-10
     slope[:, 3, 0] = 1.0  # it would have to be driven
     assert pinn.residuals(value, slope, data)[1] > 0.1
+
+
+def test_a_denoiser_begins_as_the_gaussian_and_learns(truth):
+    """.50 with the Gaussian, .38 after 60 steps, on noise that it has not seen."""
+    tracked = measure_noise(truth, NoiseModel(), seed=3)
+    inputs, unit = denoiser.seen(tracked)
+    with torch.no_grad():
+        begin = denoiser.Network()(inputs).numpy() * unit
+    np.testing.assert_allclose(begin, gaussian.fit(tracked, fwhm=denoiser.FWHM), atol=1e-6)
+    network = denoiser.trained([truth], steps=60, seed=0)
+    with torch.no_grad():
+        learned = network(inputs).numpy() * unit
+    assert error(learned, truth) < 0.85 * error(begin, truth)
 
 
 def test_confidence_is_zero_where_nothing_was_measured(measured):
