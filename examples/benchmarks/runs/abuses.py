@@ -34,7 +34,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from limited_child import in_child
+from limited_child import in_child, in_children
 
 import geometry
 import regularize as reg
@@ -178,7 +178,7 @@ def main() -> None:
 
     parser = argparse.ArgumentParser(description=str(__doc__).splitlines()[0])
     parser.add_argument("--seconds", type=float, default=1200.0, help="time budget")
-    parser.add_argument("--only", default="", metavar="WORD", help="calls with this in their name")
+    parser.add_argument("--only", default="", metavar="WORD,...", help="calls with one of these in their name")
     parser.add_argument("--part", type=float, default=1.0, help="part of the abuses that is made, drawn at random")
     parser.add_argument("--seed", type=int, default=0, help="of that draw")
     parser.add_argument("--out", type=Path, help="every abuse with its outcome, JSON")
@@ -188,25 +188,25 @@ def main() -> None:
     out = args.out and args.out.resolve()
     with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):  # text in the place of a path is one
         for name, (function, sound) in calls(Path(folder)).items():
-            if args.only not in name:
+            if not any(word in name for word in args.only.split(",")):
                 continue
             if time.perf_counter() - began > args.seconds:
                 break
             kind, same = in_child(partial(outcome, partial(function, **sound)), HANG)
             assert kind == "read", (name, kind, same)
-            for argument, value in sound.items():
-                for how, other in wrong(value):
-                    if time.perf_counter() - began > args.seconds:
-                        break
-                    if draw.random() > args.part:
-                        continue
-                    given = sound | {argument: other}
-                    kind, text = in_child(partial(outcome, partial(function, **given)), HANG)
-                    if kind == "read":
-                        kind = "same" if text == same else "accepted"
-                    rows.append({"call": name, "argument": argument, "wrong": how, "ended": kind, "said": text[:400]})
-                    if kind in HARM:
-                        print(name, argument, how, kind, text[:240], sep=" | ", flush=True)
+            given = [
+                (argument, how, sound | {argument: other})
+                for argument, value in sound.items()
+                for how, other in wrong(value)
+                if draw.random() <= args.part
+            ]
+            answers = in_children([partial(outcome, partial(function, **one)) for _, _, one in given], HANG)
+            for (argument, how, _), (kind, text) in zip(given, answers, strict=True):
+                if kind == "read":
+                    kind = "same" if text == same else "accepted"
+                rows.append({"call": name, "argument": argument, "wrong": how, "ended": kind, "said": text[:400]})
+                if kind in HARM:
+                    print(name, argument, how, kind, text[:240], sep=" | ", flush=True)
     if out:
         out.write_text(json.dumps(rows, indent=1), encoding="utf-8")
     print(f"{len(rows)} abuses in {time.perf_counter() - began:.0f} s")
