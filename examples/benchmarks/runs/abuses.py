@@ -28,6 +28,7 @@ import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import fields, is_dataclass, replace
+from fractions import Fraction
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -72,11 +73,27 @@ def wrong(value: object) -> Iterator[tuple[str, object]]:
         yield from ((f"{how} tensor", torch.from_numpy(array)) for how, array in arrays(value.numpy()) if plain(array))
         yield from (("meta", value.to("meta")), ("numpy", value.numpy()), ("list", value.tolist()), ("None", None))
         yield "sparse", value.to_sparse() if value.ndim else None
+        yield from (
+            ("one of it", value.reshape(-1)[:1].squeeze()),
+            ("every other", value.reshape(*value.shape, 1).repeat_interleave(2, -1)[..., 0]),
+        )
+        if value.is_floating_point():
+            yield "with gradient", value.clone().requires_grad_()
     elif isinstance(value, np.ndarray):
         yield from arrays(value)
         yield from (("list", value.tolist()), ("None", None), ("text", "text"))
+        yield from (("backwards", value[::-1]), ("masked", np.ma.masked_array(value, mask=value == value.flat[0])))
+        yield from (("bytes swapped", value.astype(value.dtype.newbyteorder())), ("tensor", torch.from_numpy(value)))
     elif isinstance(value, bool | int | float):
         yield from NUMBERS.items()
+        yield from (("of numpy", np.asarray(value)[()]), ("array of none", np.asarray(value)), ("complex", value + 0j))
+        yield from (("tensor of none", torch.tensor(value)), ("meta", torch.tensor(value, device="meta")))
+        yield from (
+            ("10**400", 10**400),
+            ("fraction", Fraction(value)),
+            ("bytes", b"1"),
+            ("float32", np.float32(value)),
+        )
     elif isinstance(value, tuple) and value and all(isinstance(one, int | float) for one in value):
         yield from (("empty", ()), ("shorter", value[:-1]), ("longer", (*value, value[-1])), ("None", None))
         yield from ((f"{how} first", (number, *value[1:])) for how, number in NUMBERS.items())
