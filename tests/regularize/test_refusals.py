@@ -106,8 +106,14 @@ REFUSED: dict[str, tuple[Callable[[], object], str]] = {
     "short right": (lambda: FACTOR.solve(RIGHT[:5]), r"the right-hand side has the shape \(5, 3\)"),
 }
 MORE: dict[str, tuple[Callable[[], object], str]] = {
-    "place": (lambda: basis(torch.tensor([math.nan]), 3), "basis: t must be finite and within 1e.06 of 0"),
-    "far place": (lambda: basis(torch.tensor([1e30]), 3), "basis: t must be finite and within 1e.06 of 0"),
+    "place": (
+        lambda: basis(torch.tensor([math.nan]), 3),
+        "basis: t must be floating point, finite and within 1e.06 of 0",
+    ),
+    "far place": (
+        lambda: basis(torch.tensor([1e30]), 3),
+        "basis: t must be floating point, finite and within 1e.06 of 0",
+    ),
     "number of nothing": (
         lambda: LinearData(POINTS, VALUES, torch.zeros(40).long(), torch.tensor([math.nan]), torch.ones(1)),
         "LinearData: value must be finite, of the shape .n., got a tensor",

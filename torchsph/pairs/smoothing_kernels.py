@@ -187,6 +187,6 @@ def kernel(name: str | SmoothingKernel) -> SmoothingKernel:
     """The kernel called ``name``; a ValueError lists the known names."""
     if isinstance(name, SmoothingKernel):
         return name
-    if name not in KERNELS:
-        raise ValueError(f"unknown smoothing kernel '{name}'; known: {', '.join(sorted(KERNELS))}")
+    if not isinstance(name, str) or name not in KERNELS:
+        raise ValueError(f"unknown smoothing kernel {name!r:.60}; known: {', '.join(sorted(KERNELS))}")
     return KERNELS[name]

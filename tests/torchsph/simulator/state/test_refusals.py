@@ -121,9 +121,15 @@ REFUSED: dict[str, tuple[Callable[[], object], str]] = {
     ),
     "flux of NaN": (lambda: ts.Valve(1, ((0.0, 1.0),), flux=NAN), "Valve: flux must be finite, got nan"),
     "endless run-out": (lambda: ts.Reservoir(run_out=math.inf), "Reservoir: run_out must be finite, got inf"),
-    "slip of NaN": (lambda: ts.CompleteKernelWall(no_slip=NAN), "CompleteKernelWall: no_slip must be True or False, got nan"),
+    "slip of NaN": (
+        lambda: ts.CompleteKernelWall(no_slip=NAN),
+        "CompleteKernelWall: no_slip must be True or False, got nan",
+    ),
     "half a try": (lambda: ts.Rollback(tries=1.5), "Rollback: tries must be a whole number, got 1.5"),
-    "support of infinity": (lambda: ts.preset("default", smoothing_ratio=math.inf), "Projection: smoothing_ratio must be finite, got inf"),
+    "support of infinity": (
+        lambda: ts.preset("default", smoothing_ratio=math.inf),
+        "Projection: smoothing_ratio must be finite, got inf",
+    ),
     "speed of text": (lambda: ts.preset("weakly_compressible", sound_speed="fast"), "sound_speed must be a number"),
     "odd transfer": (lambda: ts.Transfer(projections=NAN), "Transfer: projections must be a whole number"),
     "odd memory": (lambda: ts.EnsembleOptions(model_error=NAN), "EnsembleOptions: model_error must be finite, got nan"),
