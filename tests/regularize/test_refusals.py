@@ -78,7 +78,10 @@ REFUSED: dict[str, tuple[Callable[[], object], str]] = {
         "direction must be finite",
     ),
     "weights of a divergence": (lambda: DivergenceRows(KNOTS, POINTS, 3, ONES[:5, 0]), r"must be \(40,\)"),
-    "points of a divergence": (lambda: DivergenceRows(KNOTS, POINTS[:, 0], 3, ONES[:, 0]), r"expected \(n, 3\)"),
+    "points of a divergence": (
+        lambda: DivergenceRows(KNOTS, POINTS[:, 0], 3, ONES[:, 0]),
+        r"DivergenceRows: points must be of the shape \(n, A\)",
+    ),
     "knots of text": (
         lambda: Knots(("0", 0.0, 0.0), (0.005,) * 3, (2, 2, 2)),
         "origin must be a sequence, each a number, got",
