@@ -18,7 +18,7 @@ from .field_checks import axis_order, wrapped_speeds
 from .finding import Finding
 from .recording import Recording
 from .rules import measured_nodes
-from .wall_checks import bodies, fluxes, mask_and_wall, volumes, wall_motion
+from .wall_checks import bodies, fluxes, mask_and_wall, shells, volumes, wall_motion
 
 LARGEST = 1.0  # m; hearts and vessels are smaller
 SMALLEST = 1e-3  # m
@@ -39,7 +39,19 @@ def findings(recording: Recording, *, severe_only: bool = False) -> list[Finding
         severe_only: look only for what is refused, which is quick.
     """
     severe: tuple[Callable[[Recording], Iterator[Finding]], ...] = (_lengths, _times, _errors, bodies, mask_and_wall)
-    others = (_speeds, _fluid, _coverage, _regions, _valves, axis_order, wrapped_speeds, volumes, fluxes, wall_motion)
+    others: tuple[Callable[[Recording], Iterator[Finding]], ...] = (
+        _speeds,
+        _fluid,
+        _coverage,
+        _regions,
+        _valves,
+        axis_order,
+        wrapped_speeds,
+        volumes,
+        fluxes,
+        wall_motion,
+        shells,
+    )
     found = [finding for check in (severe if severe_only else (*severe, *others)) for finding in check(recording)]
     kept = [finding for finding in found if finding.severe or not severe_only]
     return sorted(kept, key=lambda finding: not finding.severe)

@@ -17,7 +17,7 @@ from .banded import dense_block
 class Factor:
     """Cholesky factor of a normal matrix; serves any right-hand sides of the same rows and weights.
 
-    ``band`` (unknowns, width) is the lower band as in :func:`regularize.assembly.empty_band`, float64 or
+    ``band`` (unknowns, width) is the lower band as in :func:`regularize.rows.assembly.empty_band`, float64 or
     float32; it is overwritten.
     """
 

@@ -23,6 +23,7 @@ from .ensemble.options import EnsembleOptions
 from .forecast_skill import ForecastSkill, skill
 from .free_run import run_freely
 from .measurement.prepared import PreparedMeasurement
+from .members.amplitude import Amplitude
 from .members.draws import spline_frames
 from .members.frames import FrameObserver
 from .members.kept import MemberFile
@@ -307,7 +308,8 @@ def _read_once(resume: bool | Saved, checkpoints: str | Path | None) -> bool | S
 
 def _drawn(prepared: PreparedMeasurement, count: int, seed: int) -> MemberCurves:
     """What draws from the splines' posterior give."""
-    frames = spline_frames(prepared.splines, prepared.smoothed, count, seed=seed)
+    amplitude = Amplitude(prepared.balance, prepared.amplitude_error, count, seed)
+    frames = spline_frames(prepared.splines, prepared.smoothed, count, seed=seed, amplitude=amplitude)
     return quantified(prepared.smoothed, frames)
 
 

@@ -94,7 +94,10 @@ def _half_offsets(dimension: int) -> list[tuple[int, ...]]:
 
 def _shifted(cell: Tensor, offset: tuple[int, ...], cells: Tensor, period: Tensor | None) -> tuple[Tensor, Tensor]:
     """Neighbouring cell, wrapped on periodic axes, and whether it exists."""
-    target = cell + torch.tensor(offset, device=cell.device)
+    target = cell.clone()
+    for axis, steps in enumerate(offset):
+        if steps:
+            target[:, axis] += steps
     if period is not None:
         target = torch.where(torch.isfinite(period), torch.remainder(target, cells), target)
     real = ((target >= 0) & (target < cells)).all(1)

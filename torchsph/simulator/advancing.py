@@ -19,6 +19,7 @@ from .state.neighbour_list import PairSearch, rows_carried
 from .state.particles import Particles, frozen, rows_frozen
 from .state.record import Record
 from .stepping.coefficients import Coefficients, Parameters
+from .stepping.replayed_step import Step
 from .stepping.step_length import StepControl
 from .stepping.stepper import make_stepper
 from .surroundings import PresentSurroundings
@@ -120,7 +121,7 @@ class AdvancingRun:
         self.particles, self._acceleration = self._spatial.begin(self.particles, self._acceleration)
         longest = self._longest_step(until)
         for stop in self.domain.breaks(self.time, until):
-            self.surroundings.enter(self.time, stop, valve_strength=self.parameters.valve_strength)
+            self.surroundings.enter(self.time, stop)
             self._renumbered(self.surroundings.prepare(self.particles))
             self._advance_interval(stop, longest)
             self.time = stop
@@ -163,12 +164,13 @@ class AdvancingRun:
                 None if earlier is None else earlier.factor,
             )
             hopeless = (left > 0) & (step * _MOST_STEPS < left)
-            if bool(hopeless.any()):
+            any_hopeless, any_waiting = torch.stack([hopeless.any(), (step == 0).any()]).tolist()
+            if any_hopeless:
                 freeze_members(hopeless, self.record, self.time)
                 continue
             self.surroundings.at(self.time + done * self.units.time)
             self._prepare_step(step > 0)
-            done = self._take_step(step, done, earlier)
+            done = self._take_step(step, done, earlier, any_waiting)
             if self.observers:
                 length = torch.where(self.record.failed, torch.zeros_like(step), step) * self.units.time
                 for observer in self.observers:
@@ -202,15 +204,18 @@ class AdvancingRun:
             self.particles = self._pressures.driven(self.particles, self.surroundings.clock, self._stepper, active)
         self.particles, self._acceleration = self._spatial.when_due(self.particles, self._acceleration)
 
-    def _take_step(self, step: Tensor, done: Tensor, earlier: RollbackStates | None) -> Tensor:
-        """Step every member by its own ``step`` (members,); how far each has come in the interval (members,)."""
+    def _take_step(self, step: Tensor, done: Tensor, earlier: RollbackStates | None, any_waiting: bool) -> Tensor:
+        """Step every member by its own ``step`` (members,), 0 for some if ``any_waiting``.
+
+        Returns how far each has come in the interval, (members,).
+        """
         before, old = self.particles, self._acceleration
-        inner = step.to(before.position.dtype)
-        stepped, acceleration, wall = self._stepper.step(before, inner, self.record.steps, self.surroundings)
-        self.surroundings.at(self.time + (done + step) * self.units.time)
-        after = self.surroundings.constrain(before, stepped, wall, inner, self.record)
-        waiting = step == 0
-        if bool(waiting.any()):
+        inner, ends = step.to(before.position.dtype), self.time + (done + step) * self.units.time
+        number = self.record.steps.clone()
+        plan = Step(self._stepper, self.surroundings, self.record, inner, ends, number)
+        after, acceleration, stepped, wall = plan.take(before)
+        if any_waiting:
+            waiting = step == 0
             after, acceleration = frozen(waiting, before, after), rows_frozen(waiting, before, old, acceleration)
         self.particles, self._acceleration, done = after, acceleration, done + step
         broken = broken_members(after, self.domain.scheme, self.record) & ~self.record.failed

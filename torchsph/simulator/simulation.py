@@ -74,10 +74,13 @@ class Simulation(AdvancingRun):
         if values.get("xsph") is not None and scheme.xsph is None:
             raise ValueError("parameter 'xsph' needs a scheme with XSPH, which says of what level and form it is")
         if "valve_strength" in values and not self.domain.valves.takes_strength:
-            raise ValueError("parameter 'valve_strength' needs pressure sources or valves that are given a pressure")
+            raise ValueError(
+                "parameter 'valve_strength' needs pressure sources, or valves with a given flux or pressure"
+            )
         if "smoothing_ratio" in values and self.domain.walls is not None and scheme.wall.complete:
             raise ValueError("the tables of a complete-kernel wall are made for the scheme's smoothing_ratio")
         self.parameters = self.parameters.changed(self.particles.velocity, self.members, **values)
+        self.surroundings.valve_strength = self.parameters.valve_strength
         self._coefficients = Coefficients.of(self.parameters, self.units, self.domain.scene.fluid.density)
         self._stepper.use(self._coefficients)
         self._stepper.pair_search.radius = self._stepper.support.radius

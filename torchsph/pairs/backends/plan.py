@@ -19,8 +19,10 @@ from ..terms import (
     BY_MASS,
     BY_VOLUME,
     COMPANIES,
+    FIELDS,
     PRESSURE_FORMS,
     RATE,
+    SCALAR,
     SINGLE,
     TERMS,
     flags,
@@ -34,6 +36,8 @@ from ..terms import (
 )
 SHEPARD, LAPLACIAN = flags("shepard"), flags("laplacian")
 STRESSED, SLOPED = reading("stress"), reading("slope")
+# the scalars of ``FIELDS`` in their order, which is that of their rows in the array of a Triton kernel
+SCALARS = tuple(name for name, rank in FIELDS.items() if rank == SCALAR)
 
 # what an incompressible step asks for at once; loops over these rates take Shepard's sums along
 _WITH_SHEPARD = (CONTINUITY, CONTINUITY | CONCENTRATION)
@@ -59,6 +63,15 @@ class Pass:
     def outputs(self) -> list[str]:
         """Names of the sums, in the order in which a pass returns them."""
         return [output.name for output in outputs_of(self.terms)]
+
+
+def rows_of(dimension: int) -> dict[str, slice]:
+    """Where each field stands in the array of a Triton kernel."""
+    vectors = {
+        name: slice(k * dimension, (k + 1) * dimension) for k, name in enumerate(("position", "velocity", "slope"))
+    }
+    scalars = {name: slice(3 * dimension + k, 3 * dimension + k + 1) for k, name in enumerate(("weight", *SCALARS))}
+    return vectors | scalars
 
 
 def allocate(terms: int, position: Tensor) -> list[Tensor]:

@@ -13,13 +13,14 @@ from __future__ import annotations
 
 import itertools
 import os
+from collections.abc import Hashable
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from ..cell_search import _cells, _key, _shifted
-from ..interface import Moments, PairState, Support, check_search
+from ..interface import Moments, MomentumTerms, PairState, Support, check_search
 from ..terms import BY_VOLUME, FIELDS, SLOPE, VALUE, outputs_of, reading
 from . import plan
 from .checks import check_particles, check_period
@@ -82,6 +83,32 @@ def cell_runs(position: Tensor, member: Tensor, radius: float, period: Tensor | 
     return CellRuns(order, own.to(torch.int32), start, stop, lengths_of_axes, int(own[-1]) + 1)
 
 
+@dataclass(frozen=True)
+class KernelConstants:
+    """What a pass needs beside the particles, on their device.
+
+    Attributes:
+        coefficients: (members, 5), as the kernel reads them.
+        periods: (3,), inf where an axis is not periodic.
+        scale: (members,) prefactors of the sums, by their power of the smoothing length.
+    """
+
+    coefficients: Tensor
+    periods: Tensor
+    scale: dict[int, Tensor]
+
+    @classmethod
+    def of(cls, support: Support, momentum: MomentumTerms | None, pairs: CellRuns, like: Tensor) -> KernelConstants:
+        """Made anew, in the precision and on the device of ``like``."""
+        table, dimension = plan.coefficients(support, momentum, pairs.members), len(pairs.period)
+        sigma, length = support.kernel.normalisation[dimension], table[:, 0]
+        return cls(
+            _kernel_coefficients(table).to(like),
+            like.new_tensor([*pairs.period, float("inf")][:3]),
+            {power: (sigma / length ** (dimension + power)).to(like) for power in (VALUE, SLOPE)},
+        )
+
+
 class CudaBackend(PlannedBackend[CellRuns]):
     """Pair sums in Triton, float32 or float64; not differentiable."""
 
@@ -95,6 +122,7 @@ class CudaBackend(PlannedBackend[CellRuns]):
         self.device = "cpu" if interpreted else "cuda"
         # the interpreter's time goes with the number of programs, whatever their width
         self._block = 1024 if interpreted else 64
+        self._sent: dict[Hashable, KernelConstants] = {}
 
     def search(
         self,
@@ -139,25 +167,24 @@ class CudaBackend(PlannedBackend[CellRuns]):
         field: Tensor | None = None,
         active: Tensor | None = None,
     ) -> list[Tensor]:
-        kind, (reach, sigma) = plan.kernel_choice(support, self.name)
+        kind, (reach, _) = plan.kernel_choice(support, self.name)
         outputs = plan.allocate(request.terms, state.position)
         if pairs.count == 0:
             return outputs
         terms = request.terms
         packed, factor = self._pack(pairs, state, request, field, active)
-        table = plan.coefficients(support, request.momentum, pairs.members)
+        constants = self._constants(support, request.momentum, pairs, packed)
         width = sum(output[0].numel() for output in outputs)
         raw = packed.new_empty((width, pairs.count))
-        periods = packed.new_tensor([*pairs.period, float("inf")][:3])
         self._kernels.pair_sums[(triton_blocks(pairs.count, self._block),)](
             packed,
             self._own_stress(packed, request, state.position.shape[1]),
             raw,
-            _kernel_coefficients(table).to(packed),
+            constants.coefficients,
             pairs.member,
             pairs.start,
             pairs.stop,
-            periods,
+            constants.periods,
             reach,
             pairs.count,
             D=state.position.shape[1],
@@ -167,8 +194,24 @@ class CudaBackend(PlannedBackend[CellRuns]):
             BLOCK=self._block,
             TERMS=terms,
         )
-        _scale(raw, outputs, pairs, terms, table[:, 0], sigma, factor)
+        _scale(raw, outputs, pairs, terms, constants.scale, factor)
         return outputs
+
+    def _constants(
+        self, support: Support, momentum: MomentumTerms | None, pairs: CellRuns, like: Tensor
+    ) -> KernelConstants:
+        """The numbers of a pass; sent to the device once where they are plain, for a solver asks for them often."""
+        terms = None if momentum is None else (momentum.artificial, momentum.laminar, momentum.tensile)
+        numbers = (support.length, *(terms or ()))
+        if any(isinstance(value, Tensor) for value in numbers):
+            return KernelConstants.of(support, momentum, pairs, like)
+        kind = (support.kernel.name, support.kernel.support, support.length, support.dimension, momentum)
+        key = (*kind, pairs.members, tuple(pairs.period), like.dtype, like.device)
+        if key not in self._sent:
+            while len(self._sent) >= _CONSTANTS_KEPT:
+                self._sent.pop(next(iter(self._sent)))
+            self._sent[key] = KernelConstants.of(support, momentum, pairs, like)
+        return self._sent[key]
 
     def _pack(
         self, pairs: CellRuns, state: PairState, request: plan.Pass, field: Tensor | None, active: Tensor | None
@@ -178,7 +221,7 @@ class CudaBackend(PlannedBackend[CellRuns]):
         for name in FIELDS:
             if request.terms & reading(name):
                 quantities[name] = _field(name, state, request, field)
-        rows = self._kernels.rows_of(state.position.shape[1])
+        rows = plan.rows_of(state.position.shape[1])
         packed = state.position.new_empty((max(row.stop for row in rows.values()), pairs.count))
         for name, values in quantities.items():
             packed[rows[name]] = values[:, pairs.order]
@@ -188,7 +231,7 @@ class CudaBackend(PlannedBackend[CellRuns]):
         """The pressure with which a particle a enters its own sum: |p| or -p in two of the forms."""
         if request.momentum is None or request.momentum.pressure is None:
             return packed
-        stress = packed[self._kernels.rows_of(dimension)["stress"]]
+        stress = packed[plan.rows_of(dimension)["stress"]]
         form = request.momentum.pressure
         return stress.abs() if form == "switched" else -stress if form == "difference" else stress
 
@@ -198,6 +241,7 @@ def triton_blocks(count: int, block: int) -> int:
     return (count + block - 1) // block
 
 
+_CONSTANTS_KEPT = 64  # of passes: a run has a dozen kinds of them
 _OLDEST_TRITON = (3, 3)  # the first whose kernels may hold tuples
 
 
@@ -238,15 +282,13 @@ def _kernel_coefficients(table: Tensor) -> Tensor:
 
 
 def _scale(
-    raw: Tensor, outputs: list[Tensor], pairs: CellRuns, terms: int, length: Tensor, sigma: float, factor: Tensor
+    raw: Tensor, outputs: list[Tensor], pairs: CellRuns, terms: int, scale: dict[int, Tensor], factor: Tensor
 ) -> None:
     """Write sums with their prefactors into ``outputs``, in the caller's order of particles."""
-    dimension, row = len(pairs.period), 0
-    member = pairs.member.to(torch.int64)
-    scale = {power: (sigma / length ** (dimension + power)).to(raw)[member] for power in (VALUE, SLOPE)}
+    member, row = pairs.member.to(torch.int64), 0
     for given, output in zip(outputs_of(terms), outputs, strict=True):
         width = output[0].numel()
-        own = given.times * scale[given.power]
+        own = given.times * scale[given.power][member]
         part = raw[row : row + width] * (own * factor if given.own else own)
         output[pairs.order] = part.T.reshape(output.shape)
         row += width

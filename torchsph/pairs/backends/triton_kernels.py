@@ -17,7 +17,8 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from ..terms import FIELDS, SCALAR, flags, reading
+from ..terms import flags, reading
+from .plan import SCALARS
 from .triton_smoothing import smoothing_kernel
 
 CONTINUITY = tl.constexpr(flags("continuity"))
@@ -35,8 +36,6 @@ GRADIENT = tl.constexpr(flags("gradient"))
 CORRECTED_DIFFUSION = tl.constexpr(flags("corrected_diffusion"))
 MOMENTS = tl.constexpr(flags("moments"))
 
-# the scalars of ``FIELDS`` in their order, which is that of their rows
-SCALARS = tuple(name for name, rank in FIELDS.items() if rank == SCALAR)
 STRESS = tl.constexpr(SCALARS.index("stress"))
 INERTIA = tl.constexpr(SCALARS.index("inertia"))
 INVERSE = tl.constexpr(SCALARS.index("inverse"))
@@ -52,15 +51,6 @@ INVERSE_READERS = tl.constexpr(reading("inverse"))
 DEVIATION_READERS = tl.constexpr(reading("deviation"))
 MASS_READERS = tl.constexpr(reading("mass"))
 FIELD_READERS = tl.constexpr(reading("field"))
-
-
-def rows_of(dimension: int) -> dict[str, slice]:
-    """Where each field stands in the array of a kernel."""
-    vectors = {
-        name: slice(k * dimension, (k + 1) * dimension) for k, name in enumerate(("position", "velocity", "slope"))
-    }
-    scalars = {name: slice(3 * dimension + k, 3 * dimension + k + 1) for k, name in enumerate(("weight", *SCALARS))}
-    return vectors | scalars
 
 
 @triton.jit

@@ -75,7 +75,9 @@ class Particles:
 
     def select(self, keep: Tensor) -> Particles:
         """The particles where ``keep`` (N,) bool, or the indices in ``keep``."""
-        return self.changed(**{name: value[keep] for name, value in self.arrays().items()})
+        # the places are looked up once for all arrays: each time the processor has to wait for a GPU
+        rows = torch.nonzero(keep).squeeze(1) if keep.dtype == torch.bool else keep
+        return self.changed(**{name: value[rows] for name, value in self.arrays().items()})
 
     def joined(self, other: Particles) -> Particles:
         """These particles followed by those of ``other``; where they lack them these get labels and full confidence."""

@@ -17,7 +17,7 @@ def volume_of_rows(particles: Particles, row: Tensor) -> Tensor:
     """Volume of the particles in ``row`` of each member, (members,); never 0."""
     mass = particles.mass[row]
     total = mass.new_zeros(particles.members).index_add(0, particles.member[row], mass)
-    return total.clamp_min(float(particles.mass.mean()) if particles.count else 1.0)
+    return torch.maximum(total, particles.mass.mean()) if particles.count else total.clamp_min(1.0)
 
 
 def mean_near(particles: Particles, plane: OpeningPlane, values: Tensor) -> Tensor:

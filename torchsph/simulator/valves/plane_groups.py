@@ -29,9 +29,11 @@ def groups(openings: Openings, clock: Clock, members: int, stepping: Tensor | No
         members: their number.
         stepping: (members,) bool, those that count; None: all.
     """
-    counted = stepping is None or bool(stepping.all())
     place = openings.place_number(clock.times)
-    if place.ndim == 0 or members == 1 or bool((place == place[0]).all()):
+    everybody = place.new_ones((), dtype=torch.bool) if stepping is None else stepping.all()
+    alike = place.new_ones((), dtype=torch.bool) if place.ndim == 0 or members == 1 else (place == place[0]).all()
+    counted, alike = torch.stack([everybody, alike]).tolist()  # one look at the device for both
+    if alike:
         return None if counted or stepping is None else [stepping]
     if counted or stepping is None:
         return [place == number for number in torch.unique(place)]

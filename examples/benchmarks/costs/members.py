@@ -1,6 +1,6 @@
 """What a member costs in a batch of many, and how far from real time an ensemble's forecasts are.
 
-    python examples/benchmarks/members.py [--quick] [--json FILE] [--spacing M] [--members N ...] [--device cpu]
+    python examples/benchmarks/costs/members.py [--quick] [--json FILE] [--spacing M] [--members N ...] [--device cpu]
 
 Forecasts of the sample from frame to frame (10 ms), as the ensemble makes them: imposed, projected, advanced,
 fetched; default preset, one thread. Sizes of the batch take turns, and of the repeats the cheapest counts, so that what
@@ -24,7 +24,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+sys.path.insert(0, str(Path(__file__).resolve().parents[3]))
 
 import numpy as np
 import torch

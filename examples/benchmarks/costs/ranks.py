@@ -1,6 +1,6 @@
 """One and two processes of one thread each on the same assimilation: wall-clock, CPU seconds, and what bounds the gain.
 
-    python examples/benchmarks/ranks.py [--quick] [--json FILE] [--members N ...] [--frames N] [--repeats N]
+    python examples/benchmarks/costs/ranks.py [--quick] [--json FILE] [--members N ...] [--frames N] [--repeats N]
 
 Runs `torchsph assimilate`'s ensemble (with its splines and its run without data) on the sample under torchrun, with one
 process and with two in turn, and compares the analyses bit for bit. Of the repeats the fastest counts.
@@ -22,7 +22,7 @@ import tempfile
 import time
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+sys.path.insert(0, str(Path(__file__).resolve().parents[3]))
 
 import torch
 import torch.distributed as dist
