@@ -186,5 +186,3 @@ def _between(places: np.ndarray, own: np.ndarray, time: np.ndarray, period: floa
     after = np.clip(np.searchsorted(own, time), 1, len(own) - 1)
     share = np.clip((time - own[after - 1]) / (own[after] - own[after - 1]), 0, 1)[:, None, None]
     return (1 - share) * places[after - 1] + share * places[after]
-
-

@@ -111,7 +111,9 @@ def inner_sheet(surface: Surface, *, hole_region: int | Sequence[int] = 0) -> Su
     try:
         result = repaired(_part(surface, faces), hole_region=hole_region)
     except SurfaceError as fault:
-        raise SurfaceError(f"is a wall whose inner sheet cannot be told from its rim ({fault}); cut it there") from fault
+        raise SurfaceError(
+            f"is a wall whose inner sheet cannot be told from its rim ({fault}); cut it there"
+        ) from fault
     held = grid_winding(voxels.grid, result.vertices, result.faces) > 0
     beyond = held & (voxels.inside | (~voxels.block & (voxels.seen < FACING)))
     if (held & voxels.lumen).sum() < HELD * voxels.lumen.sum() or beyond.sum() > BEYOND * held.sum():
