@@ -78,7 +78,7 @@ REFUSED: dict[str, tuple[Callable[[], object], str]] = {
         "direction must be finite",
     ),
     "weights of a divergence": (lambda: DivergenceRows(KNOTS, POINTS, 3, ONES[:5, 0]), r"must be \(40,\)"),
-    "points of a divergence": (lambda: DivergenceRows(KNOTS, POINTS[:, 0], 3, ONES[:, 0]), "points must be of the shape"),
+    "points of a divergence": (
         lambda: DivergenceRows(KNOTS, POINTS[:, 0], 3, ONES[:, 0]),
         r"DivergenceRows: points must be of the shape \(n, A\)",
     ),
