@@ -27,7 +27,8 @@ def in_child(call: Callable[[], Answer], limit: float) -> Answer:
         call: what is done.
         limit: s of processor time; after them, or ``WAITING`` times as long by the clock, the child is killed.
     """
-    return next(in_children([call], limit))
+    (answer,) = in_children([call], limit)
+    return answer
 
 
 def in_children(calls: Sequence[Callable[[], Answer]], limit: float) -> Iterator[Answer]:

@@ -142,7 +142,7 @@ REFUSED: dict[str, tuple[Callable[[], object], str]] = {
     "member below 0": (lambda: resumed(member=SEEDED.member - 1), "member runs from -1 to -1"),
     "kind 9": (lambda: resumed(kind=SEEDED.kind + 9), "kind runs from 9 to 9, but the scene has 1 openings"),
     "no mass": (lambda: resumed(mass=0 * SEEDED.mass), "mass must be positive"),
-    "mass of infinity": (lambda: resumed(mass=at(math.inf, SEEDED.mass, 0)), "particles of one run are alike"),
+    "mass of infinity": (lambda: resumed(mass=at(math.inf, SEEDED.mass, 0)), "those of one run are alike"),
     "valve of no times": (lambda: ts.Valve(1, None), "Valve: intervals must be a sequence, .*, got None"),
     "half a valve": (lambda: ts.Valve(1, ((0.0,),)), "Valve: intervals must be a sequence, each .a number, a number."),
     "densities of text": (lambda: ts.Rollback(density=("low", 2.0)), "Rollback: density must be .a number, a number."),
