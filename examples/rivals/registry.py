@@ -34,13 +34,13 @@ class Rival:
 
 
 RIVALS: dict[str, Rival] = {
-    "gaussian": Rival(gaussian.fit, "common practice", {"fwhm": (3e-3, 4e-3, 5e-3, 6e-3), "power": (1.0, 2.0)}),
+    "gaussian": Rival(gaussian.fit, "common practice", {"fwhm": (1e-3, 2e-3, 3e-3, 4e-3, 5e-3), "power": (1.0, 2.0)}),
     "smoothn": Rival(smoothn.fit, "Garcia 2010; PyMUST", {"strength": (None, 4.0), "power": (1.0, 2.0)}),
-    "leray": Rival(leray.fit, "Helmholtz-Leray projection", {"fwhm": (2e-3, 3e-3, 4e-3, 5e-3), "power": (1.0, 2.0)}),
+    "leray": Rival(leray.fit, "Helmholtz-Leray projection", {"fwhm": (1e-3, 2e-3, 3e-3, 4e-3), "power": (1.0, 2.0)}),
     "ivfm": Rival(
         ivfm.fit,
         "constrained least squares, after Vixege et al. 2021",
-        {"smoothness": (1.0, 2.0, 4.0), "divergence": (10.0,), "wall": (3.0,), "power": (1.0, 2.0)},
+        {"smoothness": (0.25, 0.5, 1.0, 2.0), "divergence": (10.0,), "wall": (3.0,), "power": (1.0,)},
     ),
     "gaussian over time": Rival(
         temporal.fit,

