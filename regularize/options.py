@@ -19,9 +19,11 @@ from typing import Any, Final, Literal, Self
 
 import numpy as np
 
+from .arguments import POSITIVE, between, checked
 from .basis.bspline import DEGREES
 from .basis.sampling import mean_length
 from .errors import InvalidInput
+from .solvers.interface import MOST_ITERATIONS
 from .solvers.registry import AUTO, SOLVERS
 from .statistics.likelihood import Choice
 from .statistics.robust import CUTOFFS
@@ -34,9 +36,16 @@ SAMPLES_PER_KNOT, SAMPLES_OF_LOW_NOISE, LOW_NOISE = 3.0, 2.0, 0.2
 DIVERGENCE = 10.0  # knot distances
 CURVATURE = 3.0  # to a knot distance; the first guess of a search
 Length = float | Literal["auto"]
+LEAST, MOST = 1e-30, 1e30  # of a strength: its tenth power is still a number
 MOST_DISTANCE = 1e9  # m or s: beyond it products underflow
 LENGTHS = ("divergence", "curvature", "time_curvature")  # that a number of knots stands for
 AUTOMATIC = (None, "likelihood", "gcv")
+RANGES = {
+    "max_iterations": between(1, MOST_ITERATIONS),
+    "rounds": between(1, 10_000),
+    "tolerance": POSITIVE,
+    "search_knots": between(1.0, 1e6),
+}
 
 
 def length_of(value: Length | None) -> float:
@@ -46,6 +55,7 @@ def length_of(value: Length | None) -> float:
     return 0.0 if value is None else value
 
 
+@checked(**RANGES)
 @dataclass(frozen=True)
 class SplineOptions:
     """Options of the spline fit; ``None`` switches a part off. See the module's text for the units.
@@ -134,8 +144,9 @@ class SplineOptions:
             value = getattr(self, name)
             if value == BY_DATA and name in LENGTHS:
                 continue
-            if value is not None and (isinstance(value, str) or not 0 <= value < float("inf")):
-                raise InvalidInput(f"{name} is {value!r}: it must be finite and >= 0, or None to switch it off")
+            if value is not None and (isinstance(value, str) or not (value == 0 or LEAST < value < MOST)):
+                rule = f"0, or from {LEAST:g} to {MOST:g}, or None to switch it off"
+                raise InvalidInput(f"{name} is {value!r}: it must be {rule}")
         self._check_distances()
         if not 1 <= self.order <= self.degree and self.curvature:
             raise InvalidInput(f"order is {self.order}: it must lie between 1 and degree = {self.degree}")
@@ -150,8 +161,6 @@ class SplineOptions:
         ):
             if getattr(self, name) not in known:
                 raise InvalidInput(f"{name} is {getattr(self, name)!r}: choose one of {known}")
-        if self.tolerance <= 0 or self.max_iterations < 1 or self.rounds < 1 or self.search_knots < 1:
-            raise InvalidInput("tolerance must be > 0; max_iterations, rounds and search_knots >= 1")
         self._check_combinations()
 
     def _check_distances(self) -> None:

@@ -8,9 +8,10 @@ Cavities in a plane and in space, closed or with valves, at speeds from .2 to 6 
 - silent: 3 % of the volume lost or gained, or values that are not finite, without a word,
 - obscure: any other exception.
 
-    python examples/benchmarks/soak.py --scenes 300 --seconds 600 --out soak.json
+    python examples/benchmarks/soak.py --scenes 300 --seconds 600 --out soak.jsonl
 
-The same seed gives the same scenes; the time budget ends the list early.
+The same seed gives the same scenes; the time budget ends the list early, and the same command goes on with it: a scene
+that stands in the file, one JSON line each, is not run again.
 """
 
 from __future__ import annotations
@@ -149,23 +150,41 @@ def table(rows: list[dict[str, object]]) -> str:
     return "\n".join(lines)
 
 
+def finished_rows(path: Path | None) -> list[dict[str, object]]:
+    """What an earlier call left; a line that was cut off is not there."""
+    if path is None or not path.exists():
+        return []
+    whole = path.read_text(encoding="utf-8").rpartition("\n")[0]
+    return [json.loads(line) for line in whole.splitlines()]
+
+
 def main() -> None:
     """Run scenes until their number or the time is up."""
     parser = argparse.ArgumentParser(description=str(__doc__).splitlines()[0])
     parser.add_argument("--scenes", type=int, default=300)
     parser.add_argument("--seconds", type=float, default=600.0, help="time budget")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--out", type=Path, help="every scene with its outcome, JSON")
+    parser.add_argument("--out", type=Path, help="every scene with its outcome, JSON lines; goes on with those in it")
     args = parser.parse_args()
-    generator, rows, began = np.random.default_rng(args.seed), [], time.perf_counter()
-    while len(rows) < args.scenes and time.perf_counter() - began < args.seconds:
-        rows.append(outcome(draw(generator)))
-        row = rows[-1]
+    generator, rows, began = np.random.default_rng(args.seed), finished_rows(args.out), time.perf_counter()
+    if args.out:
+        args.out.write_text("".join(json.dumps(row) + "\n" for row in rows), encoding="utf-8")
+    for number in range(args.scenes):
+        case = draw(generator)
+        if number < len(rows):
+            if any(rows[number][name] != value for name, value in asdict(case).items()):
+                raise SystemExit(f"{args.out}: line {number + 1} is another seed's scene; name another file")
+            continue
+        if time.perf_counter() - began > args.seconds:
+            break
+        row = outcome(case)
+        rows.append(row)
         if row["ended"] != "finished":
             print({name: row[name] for name in row if name not in ("seconds",)}, flush=True)
         if args.out:
-            args.out.write_text(json.dumps(rows, indent=1), encoding="utf-8")
-    print(f"{len(rows)} scenes in {time.perf_counter() - began:.0f} s")
+            with args.out.open("a", encoding="utf-8") as lines:
+                lines.write(json.dumps(row) + "\n")
+    print(f"{len(rows)} scenes in {sum(float(str(row['seconds'])) for row in rows):.0f} s")
     print(table(rows))
 
 

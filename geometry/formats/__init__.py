@@ -1,6 +1,7 @@
 """From the files of a lab to recordings, and from recordings to the files of its viewers."""
 
 from .convert import Converted, WallOptions, convert
+from .displacement import MotionOptions
 from .export import EXPORTS, export
 from .field_map import FieldMap, read_field_map
 from .labelled_arrays import from_xarray, to_xarray
@@ -16,6 +17,7 @@ __all__ = [
     "FieldMap",
     "Format",
     "FormatError",
+    "MotionOptions",
     "PolySeries",
     "WallOptions",
     "convert",

@@ -1,8 +1,9 @@
-"""From the arrays of a file and a field map to the fields of a recording, one frame at a time."""
+"""From the arrays of a file and a field map to the fields of a recording."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -14,10 +15,11 @@ from geometry.recordings.units import factor
 
 from .field_map import FieldMap
 from .orientation import Orientation
+from .placing import fill_scalar, fill_vectors
 from .source import ArrayLike, FormatError, Source
 
 MIRROR = {"ras": np.array([-1.0, -1.0, 1.0])}  # to LPS, the coordinates that DICOM, ITK and surfaces of Slicer use
-WHOLE = (".h5", ".hdf5", ".hdf", ".he5", ".mat", ".npz", ".vtkhdf", ".nc", ".nc4", ".nii", ".gz", ".nrrd", ".mha")
+WHOLE = (".h5", ".hdf5", ".hdf", ".he5", ".mat", ".npz", ".vtkhdf", ".nc", ".nc4", ".nii", ".gz", ".nrrd", ".mha", ".vti", ".vtk", ".zarr")
 DECLARED = 64 * 2**30  # bytes; a file that claims a larger result is refused before anything is read
 
 
@@ -59,34 +61,23 @@ def assemble(source: Source, said: FieldMap) -> Fields:
     _check_components(source, names, sizes, dimension)
     counts = tuple(sizes[0][letter] for letter in "xyz"[:dimension])
     frames = sizes[0].get("t", 1)
-    _check_size(source, names[0], 4 * dimension * frames * int(np.prod(counts)), f"{frames} frames of {counts} nodes")
+    _check_size(source, names[0], 4 * dimension * frames * math.prod(counts), f"{frames} frames of {counts} nodes")
     lie = Orientation.of(_affine(source, said, counts), counts, source.path)
     grid = Grid(tuple(lie.origin), tuple(lie.spacing), tuple(counts[lie.order[a]] for a in reversed(range(dimension))))
     matrix = _matrix(source, said, lie)
     unit = said.unit("velocity") or source.velocity_unit
-    velocity = np.empty((frames, dimension, *grid.shape), np.float32)
-    _fill(velocity, source, names, axes, lie, matrix, unit)
+    velocity = np.zeros((frames, dimension, *grid.shape), np.float32)
+    fill_vectors(velocity, _vectors(source, names, axes, unit), lie, matrix)
     sigma = None
     if said.sigma:
-        sigma = np.empty_like(velocity)
-        _fill(
-            sigma,
-            source,
-            said.sigma,
-            [_axes(source, said, n, len(said.sigma) == 1) for n in said.sigma],
-            lie,
-            np.abs(matrix),
-            unit,
-        )
-    scalar = {
-        name: _scalar(source, said, getattr(said, name) or _role(source, name), lie, frames, grid)
-        for name in ("mask", "weight")
-    }
-    mask = scalar["mask"]
-    if mask is not None:
-        mask = mask == said.mask_label if said.mask_label is not None else mask > said.mask_threshold
+        sigma = np.zeros_like(velocity)
+        letters = [_axes(source, said, name, len(said.sigma) == 1) for name in said.sigma]
+        fill_vectors(sigma, _vectors(source, said.sigma, letters, unit), lie, np.abs(matrix))
+    whole = (frames, counts)
+    mask = _scalar(source, said, said.mask or _role(source, "mask"), lie, whole, (bool, said.inside))
+    weight = _scalar(source, said, said.weight or _role(source, "weight"), lie, whole, (np.float32, np.asarray))
     notes = _notes(source, said, lie, unit)
-    return Fields(grid, _time(source, said, frames), velocity, mask, scalar["weight"], sigma, lie.turn, notes)
+    return Fields(grid, _time(source, said, frames), velocity, mask, weight, sigma, lie.turn, notes)
 
 
 def _role(source: Source, name: str) -> str:
@@ -154,9 +145,10 @@ def _check_size(source: Source, name: str, needed: int, claimed: str) -> None:
     if needed > DECLARED:
         raise FormatError(f"{source.path}: {name}: claims {claimed}, more than memory holds")
     path = Path(source.path)
-    if path.suffix.lower() in WHOLE and path.is_file() and needed > UNWRITTEN + PACKED * path.stat().st_size:
+    size = sum(part.stat().st_size for part in (path.rglob("*") if path.is_dir() else [path]) if part.is_file())
+    if path.suffix.lower() in WHOLE and path.exists() and needed > UNWRITTEN + PACKED * size:
         raise FormatError(
-            f"{source.path}: {name}: claims {claimed}, but the whole file has {path.stat().st_size} bytes; write the "
+            f"{source.path}: {name}: claims {claimed}, but the whole file has {size} bytes; write the "
             "values, or name other arrays"
         )
 
@@ -226,48 +218,14 @@ def _matrix(source: Source, said: FieldMap, lie: Orientation) -> np.ndarray:
     return lie.turn.T @ world @ stored
 
 
-def _fill(
-    result: np.ndarray,
-    source: Source,
-    names: Sequence[str],
-    axes: Sequence[str],
-    lie: Orientation,
-    matrix: np.ndarray,
-    unit: float | None,
-) -> None:
-    """Write a vector field into `result`, (T, D, *grid), frame by frame and component by component.
-
-    Components that lie apart in the file come one after the other, so that each array is read from front to back.
-    """
-    result[...] = 0
-    frames, components = range(len(result)), range(result.shape[1])
-    apart = len(names) > 1 or -1 < axes[0].find("c") < axes[0].find("t")
-    pairs = [(f, c) for c in components for f in frames] if apart else [(f, c) for f in frames for c in components]
-    for frame, component in pairs:
-        name, letters = (names[0], axes[0]) if len(names) == 1 else (names[component], axes[component])
-        values = lie.field(_slab(source, name, letters, frame, component))
-        values = values * (unit or _stated(source, name))
-        for axis in np.flatnonzero(matrix[:, component]):
-            result[frame, axis] += np.asarray(matrix[axis, component] * values, np.float32)
-
-
-def _slab(source: Source, name: str, letters: str, frame: int, component: int) -> np.ndarray:
-    """One frame of one component, indexed [k, j, i], unpacked, NaN where the file has a fill value."""
-    array: ArrayLike = source.arrays[name]
-    place = {"t": frame, "c": component}
-    values = np.asarray(array[tuple(place.get(letter, slice(None)) for letter in letters)])
-    space = [letter for letter in letters if letter in "xyz"]
-    values = np.transpose(values, [space.index(letter) for letter in "zyx" if letter in space])
-    about = source.attributes.get(name, {})
-    number = {
-        key: float(np.asarray(about[key]).reshape(-1)[0])
-        for key in ("scale_factor", "add_offset", "_FillValue")
-        if key in about
-    }
-    plain = values.astype(np.float32) if values.dtype != np.float64 else values
-    if "scale_factor" in number or "add_offset" in number:
-        plain = values * number.get("scale_factor", 1.0) + number.get("add_offset", 0.0)
-    return np.where(values == number["_FillValue"], np.nan, plain) if "_FillValue" in number else plain
+def _vectors(
+    source: Source, names: Sequence[str], axes: Sequence[str], unit: float | None
+) -> list[tuple[ArrayLike, str, Mapping[str, object], float]]:
+    """The arrays of a vector field with the meaning of their axes, their attributes and their units in SI."""
+    return [
+        (source.arrays[name], letters, source.attributes.get(name, {}), unit or _stated(source, name))
+        for name, letters in zip(names, axes, strict=True)
+    ]
 
 
 def _stated(source: Source, name: str) -> float:
@@ -281,19 +239,28 @@ def _stated(source: Source, name: str) -> float:
         raise FormatError(f"{source.path}: {name}: its attribute units: {fault} (--velocity-unit)") from fault
 
 
-def _scalar(source: Source, said: FieldMap, name: str, lie: Orientation, frames: int, grid: Grid) -> np.ndarray | None:
+def _scalar(
+    source: Source,
+    said: FieldMap,
+    name: str,
+    lie: Orientation,
+    whole: tuple[int, tuple[int, ...]],
+    meaning: tuple[type, Callable[[np.ndarray], np.ndarray]],
+) -> np.ndarray | None:
+    """A scalar field, (T, *grid), for frames and nodes along i, j, k, of a type and made of what is stored."""
     if not name:
         return None
-    letters = _axes(source, said, name, False)
-    many = letters.find("t") >= 0 and source.arrays[name].shape[letters.find("t")] > 1
-    count = frames if many else 1
-    result = np.empty((frames, *grid.shape), np.float32)
-    for frame in range(count):
-        values = lie.field(_slab(source, name, letters, frame, 0))
-        if values.shape != grid.shape:
-            raise FormatError(f"{source.path}: {name} has {values.shape} nodes (z, y, x), the velocity {grid.shape}")
-        result[frame] = values
-    result[count:] = result[0]
+    letters, (frames, counts), (kind, made) = _axes(source, said, name, False), whole, meaning
+    size = dict(zip(letters, source.arrays[name].shape, strict=True))
+    if tuple(size.get(letter, 0) for letter in "xyz"[: len(counts)]) != counts or size.get("c", 1) != 1:
+        raise FormatError(
+            f"{source.path}: {name} has the shape {source.arrays[name].shape} ({letters}), the velocity has {counts} "
+            "nodes (x, y, z)"
+        )
+    if size.get("t", 1) not in (1, frames):
+        raise FormatError(f"{source.path}: {name} has {size['t']} frames, the velocity {frames}")
+    result = np.empty((frames, *(counts[lie.order[axis]] for axis in reversed(range(len(counts))))), kind)
+    fill_scalar(result, source.arrays[name], letters, source.attributes.get(name, {}), lie, made)
     return result
 
 

@@ -11,16 +11,17 @@ import numpy as np
 
 from geometry.grids.grid import Grid
 from geometry.recordings.read import read_recording
-from geometry.recordings.recording import Recording
+from geometry.recordings.recording import Recording, Wall
 from geometry.recordings.units import factor
 from geometry.surfaces.files import SUFFIXES
 
 from .assemble import Fields
+from .displacement import MotionOptions
 from .field_map import FieldMap
 from .readers.hdf5 import text
 from .series import read_fields
 from .source import FormatError
-from .walls import inside_at, wall_from_files, wall_from_mask
+from .walls import inside_at, wall_by_displacements, wall_from_files, wall_from_mask
 
 
 @dataclass(frozen=True)
@@ -32,7 +33,9 @@ class WallOptions:
         unit: of the files, a name or a number of metres.
         openings: how many of the longest holes of the files are orifices, regions 1, 2, ...
         unite: bodies that overlap become one.
+        sheet: of a wall of finite thickness, `inner` is the blood's surface; `all` if the blood is what it encloses.
         smoothing: passes of Taubin's filter over a wall from a mask.
+        motion: displacements by which the one surface moves.
     """
 
     files: tuple[str, ...] = ()
@@ -40,6 +43,8 @@ class WallOptions:
     openings: int = 0
     unite: bool = False
     smoothing: int = 0
+    motion: MotionOptions = MotionOptions()
+    sheet: str = ""
 
     def scale(self, said: FieldMap) -> float:
         """Metres per unit of the files; that of the fields where the wall's is not said."""
@@ -96,7 +101,7 @@ def convert(
     paths = [Path(name) for name in inputs]
     if not paths:
         raise FormatError("convert: no file is named")
-    missing = [path for path in (*paths, *map(Path, wall.files)) if not path.exists()]
+    missing = [path for path in (*paths, *map(Path, (*wall.files, *wall.motion.files))) if not path.exists()]
     if missing:
         raise FileNotFoundError(f"{missing[0]}: there is no such file")
     about = _Constants(rho, mu, said.period)
@@ -123,17 +128,21 @@ def _walled(fields: Fields, said: FieldMap, options: WallOptions, about: _Consta
     notes, grid, velocity, mask = list(fields.notes), fields.grid, fields.velocity, fields.mask
     known = np.isfinite(velocity).all(axis=1)
     wall = None
+    if options.motion.files and not options.files:
+        raise FormatError(f"{options.motion.files[0]}: moves a wall: name its surface (--wall)")
     if options.files:
         files = [Path(name) for name in options.files]
         turn = None if (fields.turn == np.eye(grid.dimension)).all() else fields.turn
-        wall = wall_from_files(files, options.scale(said), openings=options.openings, unite=options.unite, turn=turn)
+        wall, _ = _wall(files, said, options, fields.time, about.period, turn)
         if wall.moves and len(wall.vertices) != len(fields.time):
             raise FormatError(f"{files[0]}: {len(files)} walls for {len(fields.time)} frames of velocity")
     if mask is None and wall is not None:
-        mask = np.stack([inside_at(wall, frame, grid) for frame in range(len(fields.time))])
+        mask = _inside(wall, len(fields.time), grid)
         notes.append("no mask is named: the inside of the wall is taken")
     elif mask is None:
-        moving = (known & (np.abs(np.nan_to_num(velocity)).max(axis=1) > 0)).any(axis=0)
+        moving = np.zeros(grid.shape, bool)
+        for seen, field in zip(known, velocity, strict=True):
+            moving |= seen & (field != 0).any(axis=0)
         mask = np.broadcast_to(moving, known.shape)
         notes.append("no mask is named: nodes that ever move are taken as blood")
     if wall is None:
@@ -149,7 +158,7 @@ def _walled(fields: Fields, said: FieldMap, options: WallOptions, about: _Consta
     weight = fields.weight
     unknown = mask & ~known
     if unknown.any():
-        weight = np.where(known, 1.0 if weight is None else weight, 0.0)
+        weight = np.where(known, np.float32(1) if weight is None else weight, np.float32(0))
         notes.append(f"{int(unknown.sum())} nodes in the mask have no value: weight 0")
     recording = Recording(
         fields.time,
@@ -167,6 +176,43 @@ def _walled(fields: Fields, said: FieldMap, options: WallOptions, about: _Consta
     return Converted(recording, tuple(notes))
 
 
+def _wall(
+    files: Sequence[Path],
+    said: FieldMap,
+    options: WallOptions,
+    time: np.ndarray | None,
+    period: float,
+    turn: np.ndarray | None,
+) -> tuple[Wall, np.ndarray | None]:
+    """The wall of files, at the frames of the velocity where it moves, and the times of its own motion, if any."""
+    scale, openings, unite, sheet = options.scale(said), options.openings, options.unite, options.sheet
+    if not options.motion.files:
+        return wall_from_files(files, scale, openings=openings, unite=unite, sheet=sheet, turn=turn), None
+    if len(files) > 1:
+        raise FormatError(f"{files[1]}: a wall that moves by displacements has one surface; name the first alone")
+    return wall_by_displacements(
+        files[0],
+        options.motion,
+        scale,
+        time=time,
+        period=period,
+        openings=openings,
+        unite=unite,
+        sheet=sheet,
+        turn=turn,
+    )
+
+
+def _inside(wall: Wall, frames: int, grid: Grid) -> np.ndarray:
+    """The nodes inside a wall, (T, *grid)."""
+    if not wall.moves:
+        return np.broadcast_to(inside_at(wall, 0, grid), (frames, *grid.shape))
+    mask = np.empty((frames, *grid.shape), bool)
+    for frame in range(frames):
+        mask[frame] = inside_at(wall, frame, grid)
+    return mask
+
+
 def _walls_alone(
     paths: Sequence[Path], said: FieldMap, options: WallOptions, about: _Constants, description: str
 ) -> Converted:
@@ -177,16 +223,17 @@ def _walls_alone(
         )
     if options.files:
         raise FormatError(f"{paths[0]}: is a surface itself; name files of velocity before --wall")
-    wall = wall_from_files(paths, options.scale(said), openings=options.openings, unite=options.unite)
-    count = len(paths)
-    if count > 1 and said.interval is None and not said.period:
+    wall, stated = _wall(paths, said, options, None, said.period, None)
+    count = len(wall.vertices) if wall.moves else 1
+    if count > 1 and stated is None and said.interval is None and not said.period:
         raise FormatError(f"{paths[0]}: when were the {count} walls? Say it (--interval S or --period S)")
     step = said.interval if said.interval is not None else said.period / count
+    time = step * np.arange(count) if said.interval is not None or stated is None else stated
     points = wall.vertices.reshape(-1, 3)
     grid = Grid.covering(tuple(points.min(axis=0)), tuple(points.max(axis=0)), said.grid_spacing)
-    mask = np.stack([inside_at(wall, frame if wall.moves else 0, grid) for frame in range(count)])
+    mask = _inside(wall, count, grid)
     recording = Recording(
-        step * np.arange(count),
+        time,
         grid,
         np.zeros((count, 3, *grid.shape), np.float32),
         mask,

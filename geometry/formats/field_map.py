@@ -9,6 +9,8 @@ import tomllib
 from dataclasses import dataclass, fields
 from pathlib import Path
 
+import numpy as np
+
 from geometry.recordings.units import factor
 
 from .source import FormatError
@@ -83,6 +85,10 @@ class FieldMap:
                 raise FormatError(f"{name}: must be positive, not {value}")
         if self.period < 0 or self.bin < 0:
             raise FormatError("period and bin: must not be negative")
+
+    def inside(self, values: np.ndarray) -> np.ndarray:
+        """Where the values of a mask or of labels mean blood."""
+        return values == self.mask_label if self.mask_label is not None else values > self.mask_threshold
 
     def unit(self, quantity: str) -> float | None:
         """SI units per unit of what is stored, None where the user does not say."""

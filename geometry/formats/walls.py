@@ -13,6 +13,7 @@ from geometry.surfaces.files import read_surface
 from geometry.surfaces.segmentation import surface_from_mask
 from geometry.surfaces.surface import Surface, SurfaceError, pieces_of
 
+from .displacement import MotionOptions, read_displacements
 from .source import FormatError
 
 BEYOND = 0.25  # of a spacing: a face further outside the box of nodes closes a cut vessel
@@ -21,7 +22,13 @@ MOST_OPENINGS = 8
 
 
 def wall_from_files(
-    paths: Sequence[Path], scale: float, *, openings: int = 0, unite: bool = False, turn: np.ndarray | None = None
+    paths: Sequence[Path],
+    scale: float,
+    *,
+    openings: int = 0,
+    unite: bool = False,
+    sheet: str = "",
+    turn: np.ndarray | None = None,
 ) -> Wall:
     """The wall at rest of one file, or the moving one of a file for each frame.
 
@@ -33,6 +40,7 @@ def wall_from_files(
         scale: m per unit of the files.
         openings: how many of the longest holes are orifices; they get the regions 1, 2, ... in that order.
         unite: bodies that overlap become one.
+        sheet: "inner" or "all" of a wall of finite thickness, which is refused without it.
         turn: (3, 3), from the recording's coordinates to the files'.
 
     Raises:
@@ -40,7 +48,7 @@ def wall_from_files(
         SurfaceError: a surface cannot be read or mended.
     """
     labels = tuple(range(1, openings + 1))
-    whole = read_surface(paths[0], scale=scale, hole_region=labels, unite=unite)
+    whole = read_surface(paths[0], scale=scale, hole_region=labels, unite=unite, sheet=sheet)
     if len(paths) == 1:
         return Wall(_turned(whole.vertices, turn), whole.faces, whole.region)
     raw = read_surface(paths[0], scale=scale, mend=False)
@@ -52,6 +60,45 @@ def wall_from_files(
             raise FormatError(f"{path}: has other faces than {paths[0]}; a moving wall keeps its triangles over time")
         frames[frame] = _turned(plan @ surface.vertices, turn)
     return Wall(frames, whole.faces, whole.region)
+
+
+def wall_by_displacements(
+    path: Path,
+    options: MotionOptions,
+    scale: float,
+    *,
+    time: np.ndarray | None,
+    period: float,
+    openings: int = 0,
+    unite: bool = False,
+    sheet: str = "",
+    turn: np.ndarray | None = None,
+) -> tuple[Wall, np.ndarray | None]:
+    """The wall of a file that moves by displacements, and their times where they have any.
+
+    Args:
+        path: of the surface where it has not moved.
+        options: the displacements.
+        scale: m per unit of the surface file.
+        time: (T,), s, of the frames wanted; None: those of the displacements.
+        period: s; 0 = not periodic.
+        openings: how many of the longest holes are orifices.
+        unite: bodies that overlap become one.
+        sheet: "inner" or "all" of a wall of finite thickness, which is refused without it.
+        turn: (3, 3), from the recording's coordinates to the files'.
+
+    Raises:
+        FormatError: the displacements cannot be read, or do not reach the wall or its frames.
+        SurfaceError: the surface cannot be read or mended.
+    """
+    labels = tuple(range(1, openings + 1))
+    whole = read_surface(path, scale=scale, hole_region=labels, unite=unite, sheet=sheet)
+    raw = read_surface(path, scale=scale, mend=False)
+    motion = read_displacements(options, raw.vertices, scale)
+    plan = _provenance(whole, raw, path)
+    frames = motion.moved(raw.vertices, time, period, Path(options.files[0]))
+    vertices = np.stack([_turned(plan @ places, turn) for places in frames])
+    return Wall(vertices, whole.faces, whole.region), motion.time
 
 
 def wall_from_mask(mask: np.ndarray, grid: Grid, *, smoothing: int = 0) -> Wall:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 
+import torch
 from torch import Tensor
 
 
@@ -52,3 +53,22 @@ def check_floats(name: str, values: Tensor) -> None:
         raise ValueError(f"{name} must be floating point, not {values.dtype}")
     if values.is_sparse or values.device.type == "meta":
         raise ValueError(f"{name} must be a dense tensor that holds numbers, not {values.layout} on {values.device}")
+
+
+def device_of(name: str, device: torch.device | str) -> torch.device:
+    """A device that holds numbers.
+
+    Args:
+        name: what it is, which opens the message.
+        device: as given.
+
+    Raises:
+        ValueError: torch knows no such device, or it is "meta".
+    """
+    try:
+        found = torch.device(device)
+    except (RuntimeError, TypeError):
+        raise ValueError(f"{name} must be a device of torch, as cpu or cuda:0, not {device!r:.60}") from None
+    if found.type == "meta":
+        raise ValueError(f"{name} must hold numbers, which 'meta' does not")
+    return found

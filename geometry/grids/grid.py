@@ -17,9 +17,12 @@ import torch
 from torch import Tensor
 from torch.nn.functional import embedding_bag
 
+from geometry.arguments import between, checked, finite
+
 from .given import check_floats, numbers, whole_numbers
 
 OUTSIDE = ("clamp", "zero")
+MOST_NODES = 2_000_000_000  # whose places fill some 50 GB
 
 
 class Stencil(NamedTuple):
@@ -61,6 +64,7 @@ class Grid:
             raise ValueError(f"Grid: every axis needs at least one node, not shape {self.shape}")
 
     @classmethod
+    @checked
     def covering(cls, lower: Sequence[float], upper: Sequence[float], spacing: float | Sequence[float]) -> Grid:
         """The smallest grid of this spacing (m) from `lower` that reaches `upper` (D numbers each, m)."""
         lower, upper = numbers("Grid.covering: lower", lower), numbers("Grid.covering: upper", upper)
@@ -98,25 +102,33 @@ class Grid:
         counts = reversed(self.shape)
         return tuple(o + s * (n - 1) for o, s, n in zip(self.origin, self.spacing, counts, strict=True))
 
+    @checked
     def axis(
         self, number: int, *, dtype: torch.dtype = torch.float64, device: torch.device | str | None = None
     ) -> Tensor:
         """Node coordinates (m) along axis `number` (0 is x), `(nodes,)`."""
+        if not 0 <= number < self.dimension:
+            raise ValueError(f"Grid.axis: number must be from 0 (x) to {self.dimension - 1}, got {number}")
         count = self.shape[self.dimension - 1 - number]
         steps = torch.arange(count, dtype=torch.float64, device=device)
         return (self.origin[number] + self.spacing[number] * steps).to(dtype)
 
+    @checked
     def nodes(self, *, dtype: torch.dtype = torch.float64, device: torch.device | str | None = None) -> Tensor:
         """All nodes as points `(size, D)`, m, in the order of a flattened grid array (x fastest)."""
+        if self.size > MOST_NODES:
+            raise ValueError(f"Grid: shape {self.shape} has more nodes than any computer holds; is its spacing in m?")
         axes = [self.axis(number, dtype=dtype, device=device) for number in range(self.dimension)]
         mesh = torch.meshgrid(*reversed(axes), indexing="ij")
         return torch.stack([coordinate.reshape(-1) for coordinate in reversed(mesh)], dim=-1)
 
+    @checked
     def locate(self, points: Tensor) -> Tensor:
         """Points `(*batch, n, D)` in units of nodes from the origin, x, y, z."""
         self._check_points(points)
         return (points - points.new_tensor(self.origin)) / points.new_tensor(self.spacing)
 
+    @checked
     def contains(self, points: Tensor, *, margin: float = 0.0) -> Tensor:
         """Whether points `(*batch, n, D)` lie in the box grown by `margin` (m): bool `(*batch, n)`."""
         self._check_points(points)
@@ -125,6 +137,7 @@ class Grid:
         upper = points.new_tensor(self.upper) + margin
         return ((points >= lower) & (points <= upper)).all(dim=-1)
 
+    @checked
     def stencil(self, points: Tensor, *, outside: str = "clamp") -> Stencil:
         """The nodes and weights that interpolate multilinearly at points `(*batch, n, D)`.
 
@@ -145,8 +158,12 @@ class Grid:
             weight = weight * self.contains(points).unsqueeze(-1)
         return Stencil(first + self._offsets(place), weight)
 
+    @checked
     def sample(self, field: Tensor, points: Tensor | Stencil, *, outside: str = "clamp") -> Tensor:
         """Multilinear interpolation of `field (*lead, *shape)` at points: `(*lead, n)`.
+
+        NaN at a node that a point touches, or in the point, comes out as NaN: a particle or a member that has failed
+        spoils its own values alone.
 
         Args:
             field: (*lead, *shape).
@@ -166,14 +183,20 @@ class Grid:
         result = embedding_bag(index, rows, per_sample_weights=weight.to(rows.dtype), mode="sum")
         return result.reshape(batch, count, rows.shape[1]).transpose(1, 2).reshape(*lead, count)
 
+    @checked(values=finite())
     def spread(self, values: Tensor, points: Tensor | Stencil, *, outside: str = "clamp") -> Tensor:
         """The exact adjoint of `sample`: `values (*lead, n)` added to the nodes around: `(*lead, *shape)`.
 
         `<spread(a), b> = <a, sample(b)>` for every a and b. No division by the cell volume takes place.
+
+        Raises:
+            ValueError: shapes that do not fit, values or points that are not finite.
         """
         check_floats("Grid.spread: values", values)
         lead = tuple(values.shape[:-1])
         stencil = points if isinstance(points, Stencil) else self.stencil(points, outside=outside)
+        if not bool(torch.isfinite(stencil.weight).all()):
+            raise ValueError("Grid.spread: points must be finite")
         if values.ndim == 0 or values.shape[-1] != stencil.index.shape[-2]:
             raise ValueError(f"Grid.spread: {tuple(values.shape)} values for {stencil.index.shape[-2]} points")
         batch, count, index, weight = self._flat(stencil, lead)
@@ -185,10 +208,12 @@ class Grid:
             total = total.index_add(0, index[:, corner], rows * weight[:, corner, None].to(rows.dtype))
         return total.reshape(batch, self.size, channels).transpose(1, 2).reshape(*lead, *self.shape)
 
+    @checked
     def refined(self, spacing: float | Sequence[float]) -> Grid:
         """A grid of another spacing (m) from the same origin that covers the same box."""
         return Grid.covering(self.origin, self.upper, spacing)
 
+    @checked(nodes=between(-(10**6), 10**6))
     def padded(self, nodes: int) -> Grid:
         """The same grid with `nodes` more nodes on every side (fewer where negative)."""
         (nodes,) = whole_numbers("Grid.padded: nodes", [nodes])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from geometry.arguments import checked
 from geometry.recordings.recording import Recording
 
 from .flow_agreement import FlowAgreement, flow_agreement
@@ -65,6 +66,7 @@ class Estimates:
         return result
 
 
+@checked
 def estimated(recording: Recording) -> Estimates:
     """Estimate the wall motion (``estimate_wall``) and the valve times (``find_valve_times``) of a recording.
 

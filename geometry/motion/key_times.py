@@ -19,6 +19,8 @@ _LARGEST_BEND = 0.02
 # velocity as near to linear, as a part of the fastest wall's
 _SPARED_BEND, _SPARED_VELOCITY = 0.01, 0.01
 _SAMPLES = 4
+# between two key frames: each asks for a field of its own, and of so many no computer makes all
+_MOST_TIMES = 100_000
 
 
 class KeyTimes:
@@ -115,5 +117,12 @@ def _between(motion: WallMotion, start: int, stop: int, spacing: float, longest:
     straight = places[0] + parts[:, None, None] * (places[-1] - places[0])
     bend = np.linalg.norm(places - straight, axis=2).max()
     # cut in n, a curve leaves its chords by 1 / n^2 of what it leaves the whole one
-    count = math.ceil(max(path / (longest * spacing), math.sqrt(bend / (_LARGEST_BEND * longest * spacing))) - 1e-9)
+    step = max(longest * spacing, 1e-300)  # m
+    count = math.ceil(min(max(path / step, math.sqrt(bend / (_LARGEST_BEND * step))), 1e300) - 1e-9)
+    if count > _MOST_TIMES:
+        raise ValueError(
+            f"the wall moves {path:.3g} m between {early:g} and {late:g} s, which asks for {count:.3g} key times at "
+            f"{step:.3g} m each, more than {_MOST_TIMES}: spacing and wall must be in m, and the path between key "
+            "times (travel) a part of a spacing that can be gone"
+        )
     return [early + k / count * (late - early) for k in range(1, count)]

@@ -24,6 +24,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from geometry.arguments import ENDLESS, between, checked
+from geometry.grids.given import device_of
 from geometry.grids.grid import Grid
 from geometry.surfaces.distance import distance_and_closest
 
@@ -50,6 +52,7 @@ class WallField:
     grid: Grid
     table: Tensor
 
+    @checked
     def at(self, points: Tensor) -> WallPoint:
         """Distance, normal and wall velocity at points `(n, D)`, m; off the grid its nearest values."""
         dimension = self.grid.dimension
@@ -57,6 +60,7 @@ class WallField:
         normal = torch.nn.functional.normalize(values[1 : 1 + dimension].T, dim=-1, eps=1e-12)
         return WallPoint(self._distance(values, points), normal, values[1 + dimension :].T)
 
+    @checked
     def distance(self, points: Tensor) -> Tensor:
         """Signed distance (m) at points `(n, D)`: `(n,)`, positive inside."""
         return self._distance(self.grid.sample(self.table[: 1 + self.grid.dimension], points), points)
@@ -85,6 +89,7 @@ class MovingDistance:
         ValueError: grid and wall differ in dimension, or an option is out of its bounds.
     """
 
+    @checked(band=ENDLESS, travel=ENDLESS, keep=between(2, 10**6))
     def __init__(
         self,
         grid: Grid,
@@ -98,28 +103,30 @@ class MovingDistance:
     ) -> None:
         if grid.dimension != motion.dimension:
             raise ValueError(f"MovingDistance: a {motion.dimension}-D wall on a {grid.dimension}-D grid")
-        if not travel > 0 or keep < 2:
-            raise ValueError(f"MovingDistance: travel must be > 0 and keep >= 2, not {travel} and {keep}")
         self.grid, self.motion, self.band, self.keep = grid, motion, band, keep
-        self.dtype, self.device = dtype, torch.device(device)
+        self.dtype, self.device = dtype, device_of("MovingDistance: device", device)
         self.key_times = KeyTimes(motion, min(grid.spacing), longest_path=travel)
         self._tables: OrderedDict[int, Tensor] = OrderedDict()
         self._current: tuple[float, WallField] | None = None
 
+    @checked
     def at(self, t: float) -> WallField:
         """The wall's field at time `t` (s). The last one is remembered."""
         if self._current is None or self._current[0] != t:
             self._current = (t, WallField(self.grid, self._blend(t)))
         return self._current[1]
 
+    @checked
     def distance(self, points: Tensor, t: float) -> Tensor:
         """Signed distance (m) of points `(n, D)` at time `t`: `(n,)`, positive inside."""
         return self.at(t).distance(points)
 
+    @checked
     def normal(self, points: Tensor, t: float) -> Tensor:
         """Unit normal into the fluid, the gradient of the distance, at points `(n, D)`: `(n, D)`."""
         return self.at(t).at(points).normal
 
+    @checked
     def wall_velocity(self, points: Tensor, t: float) -> Tensor:
         """Velocity (m/s) of the closest wall point, `(n, D)`."""
         return self.at(t).at(points).velocity

@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from geometry.arguments import checked
 from geometry.surfaces.repair import rims
 from geometry.surfaces.surface import SurfaceError, pieces_of
 
@@ -40,14 +41,17 @@ class OrificePlane:
         """The rim in the coordinates of `basis`, `(m, D - 1)`, m."""
         return (self.rim - self.centroid) @ self.basis.T
 
+    @checked
     def height(self, points: Tensor) -> Tensor:
         """Distance (m) of points `(n, D)` from the plane, `(n,)`: positive outwards, out of the blood."""
         return (points - points.new_tensor(self.centroid)) @ points.new_tensor(self.normal)
 
+    @checked
     def lateral(self, points: Tensor) -> Tensor:
         """Points `(n, D)` in the coordinates of `basis`: `(n, D - 1)`, m."""
         return (points - points.new_tensor(self.centroid)) @ points.new_tensor(self.basis).T
 
+    @checked
     def lateral_distance(self, points: Tensor) -> Tensor:
         """In-plane distance (m) of points `(n, D)` to the rim, `(n,)`: positive over the opening only.
 
@@ -67,6 +71,7 @@ class Orifice:
     _edges: np.ndarray = field(repr=False)
     _memory: dict[float, OrificePlane] = field(default_factory=dict, repr=False)
 
+    @checked
     def at(self, t: float) -> OrificePlane:
         """The opening at time `t` (s); the last one asked for is remembered."""
         if t not in self._memory:
@@ -91,10 +96,12 @@ class Orifice:
         """Rim points `(m, D)`, m, in order around the opening (with inner rims after the outer one)."""
         return self.at(t).rim
 
+    @checked
     def height(self, points: Tensor, t: float) -> Tensor:
         """Distance (m) of points `(n, D)` outwards from the plane of the opening, `(n,)`."""
         return self.at(t).height(points)
 
+    @checked
     def lateral_distance(self, points: Tensor, t: float) -> Tensor:
         """In-plane distance (m) of points `(n, D)` to the rim, `(n,)`, positive over the opening."""
         return self.at(t).lateral_distance(points)
@@ -126,6 +133,7 @@ class Orifice:
         return OrificePlane(centroid, normal, area, basis, rim, pairs)
 
 
+@checked
 def orifices(motion: WallMotion) -> list[Orifice]:
     """The openings of a moving wall: one for each connected set of faces of a region above 0, by label.
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse import coo_array, csr_array, eye_array, vstack
 
+from geometry.arguments import checked
 from geometry.surfaces.surface import Surface, SurfaceError
 
 from .wall_motion import WallMotion
@@ -23,11 +24,13 @@ class Refinement:
     weights: csr_array
 
 
+@checked
 def refined(surface: Surface, spacing: float) -> Surface:
     """The same surface with all edges at most `spacing` (m) long, so that flat parts carry vertices too."""
     return refinement(surface, spacing).surface
 
 
+@checked
 def refined_motion(motion: WallMotion, spacing: float) -> WallMotion:
     """The same motion with its surface refined; new vertices move with the faces they lie on.
 
@@ -43,8 +46,8 @@ def refined_motion(motion: WallMotion, spacing: float) -> WallMotion:
 
 def refinement(surface: Surface, spacing: float) -> Refinement:
     """Halve edges longer than `spacing` (m), and cut the faces beside them, until there is none."""
-    if not spacing > 0:
-        raise SurfaceError(f"refined: spacing must be positive (m), not {spacing}")
+    if not 0 < spacing < 1e100:
+        raise SurfaceError(f"refined: spacing must be a positive length (m), not {spacing}")
     finest = np.maximum(surface.areas / (0.43 * spacing ** (surface.dimension - 1)), 1).sum()
     if finest > MOST_FACES:
         raise SurfaceError(f"refined: a spacing of {spacing:g} m asks for {finest:.1g} faces: is it in m?")

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
+from geometry.arguments import checked
 from geometry.recordings.recording import Recording
 
 from .orifices import orifices
@@ -63,6 +64,7 @@ class _Phase:
     stop_error: float
 
 
+@checked
 def find_valve_times(recording: Recording, estimate: WallEstimate | None = None) -> ValveTimes:
     """Openings' times of a recording: given, corrected where dV/dt says that they cannot be, or found.
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from geometry.arguments import checked
 from geometry.recordings.recording import Recording, Wall
 
 from .smooth_in_time import SmoothedSeries, SplineInTime
@@ -80,6 +81,7 @@ class WallEstimate:
         )
 
 
+@checked
 def estimate_wall(recording: Recording) -> WallEstimate:
     """Tell a recording's wall motion from the flicker of its segmentation.
 

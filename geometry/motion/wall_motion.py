@@ -14,10 +14,12 @@ from functools import cached_property
 
 import numpy as np
 
+from geometry.arguments import checked, finite
 from geometry.recordings.recording import Recording
 from geometry.surfaces.surface import Surface
 
 
+@checked
 @dataclass(frozen=True, eq=False)
 class WallMotion:
     """A surface of fixed faces at key frames.
@@ -45,6 +47,7 @@ class WallMotion:
             raise ValueError("WallMotion: a periodic motion needs key frames over the whole period")
 
     @classmethod
+    @checked
     def from_recording(cls, recording: Recording) -> WallMotion:
         """The motion of a recording's wall, with `/wall/velocity` where it is given.
 
@@ -66,6 +69,7 @@ class WallMotion:
         return cls.through(time, vertices, wall.faces, wall.region, rates=rates, period=recording.period)
 
     @classmethod
+    @checked(time=finite(None), vertices=finite(None, None, None), rates=finite())
     def through(
         cls,
         time: np.ndarray,
@@ -87,11 +91,14 @@ class WallMotion:
             period: s, 0 = none.
         """
         time, vertices = np.asarray(time, np.float64), np.asarray(vertices, np.float64)
+        if not len(time) or len(vertices) != len(time):
+            raise ValueError(f"WallMotion.through: vertices of {len(vertices)} key frames for {len(time)} times")
         if rates is None:
             rates = _differences(time, vertices, period)
         return cls(time, vertices, np.asarray(rates, np.float64), faces, region, period)
 
     @classmethod
+    @checked
     def at_rest(cls, surface: Surface) -> WallMotion:
         """A wall that does not move."""
         vertices = surface.vertices[None]
@@ -107,6 +114,7 @@ class WallMotion:
         """Whether there is more than one key frame."""
         return len(self.time) > 1
 
+    @checked
     def vertices(self, t: float) -> np.ndarray:
         """Vertex positions at time `t` (s), `(nv, D)`, m."""
         key, s, step = self.locate(t)
@@ -115,6 +123,7 @@ class WallMotion:
         ahead = s * s * (3 - 2 * s)
         return self._blend(key, (1 - ahead, ahead, step * s * (1 - s) ** 2, step * s * s * (s - 1)))
 
+    @checked
     def velocity(self, t: float) -> np.ndarray:
         """Vertex velocities at time `t`, `(nv, D)`, m/s: the exact derivative of `vertices`."""
         key, s, step = self.locate(t)
@@ -123,6 +132,7 @@ class WallMotion:
         slope = 6 * s * (1 - s) / step
         return self._blend(key, (-slope, slope, (1 - s) * (1 - 3 * s), s * (3 * s - 2)))
 
+    @checked
     def surface(self, t: float) -> Surface:
         """The surface at time `t`."""
         return self._first.moved(self.vertices(t))
@@ -134,10 +144,12 @@ class WallMotion:
         _ = surface.is_closed, surface.component_labels
         return surface
 
+    @checked
     def volume(self, t: float) -> float:
         """Enclosed volume at time `t`, m^3 (area, m^2, in a plane)."""
         return self.surface(t).volume
 
+    @checked
     def volume_rate(self, t: float, region: int | None = None) -> float:
         """dV/dt at time `t`, m^3/s: the flux swept by the moving faces, all or those of one region.
 
@@ -148,11 +160,13 @@ class WallMotion:
         swept = (surface.area_vectors * self.velocity(t)[self.faces].mean(axis=1)).sum(axis=1)
         return float(swept.sum() if region is None else swept[self.region == region].sum())
 
+    @checked
     def travel(self, key: int) -> float:
         """The longest way (m) that a vertex moves from key frame `key` to the next."""
         step = self.vertices_at_keys[key + 1] - self.vertices_at_keys[key]
         return float(np.sqrt((step * step).sum(axis=1)).max())
 
+    @checked
     def locate(self, t: float) -> tuple[int, float, float]:
         """Key interval of a time, place in it in [0, 1], its length (s); ValueError off the key frames."""
         if not math.isfinite(t):

@@ -7,15 +7,19 @@ sec. 5.1). Here large faces are cut and small ones gathered until there is about
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 from scipy.sparse import coo_array, csr_array
 
+from geometry.arguments import Rule, between, checked
 from geometry.surfaces.search_points import repeated, sub_triangles
 from geometry.surfaces.surface import Surface, unit
 
 from .wall_motion import WallMotion
+
+MOST_POINTS = 50_000_000  # of a wall; a spacing that asks for more is a mistake of units
 
 
 class WallPoints(NamedTuple):
@@ -45,12 +49,14 @@ class WallSampler:
         ValueError: a spacing or angle out of range.
     """
 
+    @checked(
+        spacing=between(1e-100, 1e100), smooth_angle=Rule("0 or more and less than 90", lambda value: 0 <= value < 90)
+    )
     def __init__(self, motion: WallMotion, spacing: float, *, smooth_angle: float = 40.0) -> None:
-        if not spacing > 0 or not 0 <= smooth_angle < 90:
-            given = f"{spacing} and {smooth_angle}"
-            raise ValueError(f"WallSampler: needs spacing > 0 and 0 <= smooth_angle < 90, not {given}")
         self.motion = motion
         surface = motion.surface(float(motion.time[0]))
+        if not surface.area / MOST_POINTS < spacing ** (surface.dimension - 1) < math.inf:
+            raise ValueError(f"WallSampler: spacing {spacing:g} m asks for more than {MOST_POINTS} points: is it in m?")
         owner, weights = _cut(surface, spacing)
         group = _gather(surface, owner, weights, spacing)
         count, faces = int(group.max()) + 1, len(surface.faces)
@@ -71,6 +77,7 @@ class WallSampler:
     def __len__(self) -> int:
         return len(self.region)
 
+    @checked
     def at(self, t: float) -> WallPoints:
         """The points at time `t` (s)."""
         surface = self.motion.surface(t)
@@ -82,6 +89,7 @@ class WallSampler:
         return WallPoints(points, normals, velocities, self._sum @ surface.areas, self.region)
 
 
+@checked
 def wall_points(motion: WallMotion, t: float, spacing: float, *, smooth_angle: float = 40.0) -> WallPoints:
     """Points about `spacing` (m) apart on the wall at time `t` (s); for many times keep a `WallSampler`."""
     return WallSampler(motion, spacing, smooth_angle=smooth_angle).at(t)

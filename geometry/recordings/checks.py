@@ -11,12 +11,14 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
+from geometry.arguments import checked
+
 from .errors import RecordingError
 from .field_checks import axis_order, wrapped_speeds
 from .finding import Finding
 from .recording import Recording
 from .rules import measured_nodes
-from .wall_checks import bodies, fluxes, mask_and_wall, volumes, wall_motion
+from .wall_checks import bodies, fluxes, mask_and_wall, shells, volumes, wall_motion
 
 LARGEST = 1.0  # m; hearts and vessels are smaller
 SMALLEST = 1e-3  # m
@@ -28,6 +30,7 @@ SENSELESS = 1e3  # m/s
 CLOSED = 0.5  # share of measured nodes without any motion, above which it is told
 
 
+@checked
 def findings(recording: Recording, *, severe_only: bool = False) -> list[Finding]:
     """All that is odd about a recording, the severe findings first.
 
@@ -36,7 +39,19 @@ def findings(recording: Recording, *, severe_only: bool = False) -> list[Finding
         severe_only: look only for what is refused, which is quick.
     """
     severe: tuple[Callable[[Recording], Iterator[Finding]], ...] = (_lengths, _times, _errors, bodies, mask_and_wall)
-    others = (_speeds, _fluid, _coverage, _regions, _valves, axis_order, wrapped_speeds, volumes, fluxes, wall_motion)
+    others: tuple[Callable[[Recording], Iterator[Finding]], ...] = (
+        _speeds,
+        _fluid,
+        _coverage,
+        _regions,
+        _valves,
+        axis_order,
+        wrapped_speeds,
+        volumes,
+        fluxes,
+        wall_motion,
+        shells,
+    )
     found = [finding for check in (severe if severe_only else (*severe, *others)) for finding in check(recording)]
     kept = [finding for finding in found if finding.severe or not severe_only]
     return sorted(kept, key=lambda finding: not finding.severe)

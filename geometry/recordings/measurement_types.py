@@ -14,6 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from geometry.arguments import checked
+
 from .recording import Recording
 
 
@@ -190,6 +192,7 @@ class AlongBeam(MeasurementType):
 MEASUREMENT_TYPES: tuple[type[MeasurementType], ...] = (AlongBeam, FullVectors)
 
 
+@checked
 def measurement_type(recording: Recording) -> MeasurementType:
     """What the instrument of a recording saw of the velocity."""
     return next(found for kind in MEASUREMENT_TYPES if (found := kind.of(recording)) is not None)

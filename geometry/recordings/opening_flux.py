@@ -8,6 +8,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from geometry.arguments import checked
+
 from .errors import RecordingError
 
 GROUP = "/flux"
@@ -17,6 +19,7 @@ UNSTATED = 0.1
 _NAME = re.compile(r"region_([1-9][0-9]{0,2})(_sigma)?")
 
 
+@checked
 @dataclass(frozen=True, eq=False)
 class OpeningFlux:
     """The measured flux through the openings of one region together.
@@ -35,9 +38,14 @@ class OpeningFlux:
         object.__setattr__(self, "value", np.asarray(self.value, np.float64))
         if self.sigma is not None:
             object.__setattr__(self, "sigma", np.asarray(self.sigma, np.float64))
+        for name, values in (("value", self.value), ("sigma", self.sigma)):
+            if values is not None and values.ndim != 1:
+                rule = f"must hold one number a frame, but {name} has the shape {values.shape}"
+                raise RecordingError("recording", self.dataset, rule)
         if not 1 <= self.region <= MOST_REGIONS:
             rule = f"names no opening: regions run from 1 to {MOST_REGIONS} (0 is the wall)"
             raise RecordingError("recording", self.dataset, rule)
+        self.check("recording")
 
     @property
     def dataset(self) -> str:

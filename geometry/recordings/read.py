@@ -10,6 +10,7 @@ from typing import Any
 import h5py
 import numpy as np
 
+from geometry.arguments import checked
 from geometry.grids.grid import Grid
 from geometry.surfaces.integers import narrowed
 
@@ -38,6 +39,7 @@ QUANTITIES = {
 SOFT_LINKS = 16  # a chain longer than this is a circle
 
 
+@checked
 def read_recording(path: str | Path) -> Recording:
     """Read and validate a recording file.
 
@@ -69,6 +71,7 @@ def read_recording(path: str | Path) -> Recording:
     return recording
 
 
+@checked
 def read_provenance(path: str | Path) -> dict[str, Any] | None:
     """What a file's attribute `provenance` says of its making; None where there is none, or it cannot be understood.
 

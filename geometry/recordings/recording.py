@@ -8,11 +8,12 @@ drops the z axis.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import MISSING, dataclass, fields, replace
 from typing import Any
 
 import numpy as np
 
+from geometry.arguments import checked
 from geometry.grids.grid import Grid
 from geometry.surfaces.integers import narrowed
 from geometry.surfaces.surface import Surface
@@ -78,6 +79,7 @@ class Wall:
         """Whether there is one set of vertices for each frame."""
         return self.vertices.ndim == 3
 
+    @checked
     def at(self, frame: int) -> Surface:
         """The surface at a frame."""
         return Surface(self.vertices[frame] if self.moves else self.vertices, self.faces, self.region)
@@ -148,9 +150,8 @@ class Recording:
     fluxes: tuple[OpeningFlux, ...] = ()
 
     def __post_init__(self) -> None:
+        _check_kinds(self)
         _coerce(self, "")
-        for name in ("rho", "mu", "period"):
-            object.__setattr__(self, name, float(getattr(self, name)))
         if self.mask.shape == self.grid.shape:
             object.__setattr__(self, "mask", np.broadcast_to(self.mask, (len(self.time), *self.grid.shape)))
         check_distinct(self.fluxes)
@@ -177,6 +178,7 @@ class Recording:
             found |= flux.arrays()
         return found
 
+    @checked
     def check(self, source: str = "recording") -> None:
         """Test every rule of the format.
 
@@ -189,6 +191,7 @@ class Recording:
         for rules in RULES:
             rules(self, source)
 
+    @checked
     def wall_for(self, purpose: str) -> Wall:
         """The wall, for what cannot do without one.
 
@@ -223,6 +226,7 @@ class Recording:
                 changes[name] = value[chosen]
         return replace(self, **changes)
 
+    @checked
     def with_velocity(
         self,
         velocity: np.ndarray,
@@ -263,12 +267,30 @@ class Recording:
         return np.array(rows, dtype=np.float64).reshape(-1, 3)
 
 
+def _check_kinds(recording: Recording) -> None:
+    """Refuse what is no grid, wall, flux, text or number in the place of one; numbers become Python's."""
+    kinds = (("grid", Grid), ("wall", Wall | None), ("description", str), ("fluxes", tuple))
+    wrong = [name for name, kind in kinds if not isinstance(getattr(recording, name), kind)]
+    if wrong or not all(isinstance(flux, OpeningFlux) for flux in recording.fluxes):
+        name = wrong[0] if wrong else "fluxes"
+        kind = "a tuple of OpeningFlux" if name == "fluxes" else f"a {dict(kinds)[name]}"
+        raise TypeError(f"Recording: {name} must be {kind}, got {type(getattr(recording, name)).__name__}")
+    for name in ("rho", "mu", "period"):
+        try:
+            object.__setattr__(recording, name, float(getattr(recording, name)))
+        except (TypeError, ValueError):
+            value = getattr(recording, name)
+            raise TypeError(f"Recording: {name} must be a number, got {value!r:.60}") from None
+
+
 def _coerce(instance: Wall | Recording, prefix: str) -> None:
     """Bring every array to its type; a recording keeps no reference to lists or other array types."""
     kinds = {name.removeprefix(prefix): kind for name, _, kind in LAYOUT if name.startswith(prefix)}
     datasets = {name.removeprefix(prefix): dataset for name, dataset, _ in LAYOUT if name.startswith(prefix)}
     for item in fields(instance):
         value = getattr(instance, item.name)
+        if item.name in kinds and value is None and item.default is MISSING:
+            raise RecordingError("recording", datasets[item.name], "is required, not None")
         if item.name in kinds and value is not None:
             try:
                 array = narrowed(value, kinds[item.name])

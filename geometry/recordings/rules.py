@@ -10,6 +10,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
+from geometry.arguments import checked
 from geometry.surfaces.surface import SurfaceError
 
 from .errors import RecordingError
@@ -29,6 +30,7 @@ STICKIEST = 1e6  # Pa s
 STRAY = 10.0  # sizes of the surface at most, by which vertices that no face uses may widen its box
 
 
+@checked
 def check_recording(recording: Recording, source: str = "recording") -> None:
     """Hold a recording against every rule of the format.
 

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from geometry.surfaces.overlap import refuse_overlaps
+from geometry.surfaces.shells import shell_of
 from geometry.surfaces.surface import SurfaceError
 from geometry.surfaces.winding import grid_winding
 
@@ -30,6 +31,19 @@ def bodies(recording: Recording) -> Iterator[Finding]:
     except SurfaceError as fault:
         rule, _, cure = str(fault).partition("; ")
         yield Finding("/wall/faces", rule, cure, severe=True)
+
+
+def shells(recording: Recording) -> Iterator[Finding]:
+    """A wall of finite thickness encloses its own material, not the blood."""
+    if recording.wall is None:
+        return
+    shell = shell_of(recording.wall.at(0))
+    if shell is not None:
+        rule = (
+            f"is a wall of finite thickness: {1e6 * shell.material:.3g} ml of material around "
+            f"{1e6 * shell.lumen:.3g} ml of room"
+        )
+        yield Finding("/wall/faces", rule, "if the blood is in that room, keep the inner sheet (convert --sheet inner)")
 
 
 def mask_and_wall(recording: Recording) -> Iterator[Finding]:

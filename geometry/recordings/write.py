@@ -9,6 +9,8 @@ from pathlib import Path
 import h5py
 import numpy as np
 
+from geometry.arguments import checked
+
 from .checks import refuse_implausible
 from .quality import QUALITY_NAMES
 from .recording import Recording
@@ -16,6 +18,7 @@ from .rules import check_recording
 from .whole_file import refuse_special, write_whole
 
 
+@checked
 def write_recording(
     path: str | Path,
     recording: Recording,

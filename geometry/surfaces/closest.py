@@ -14,6 +14,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
+from geometry.arguments import ENDLESS, checked, finite
+
 from .search_points import repeated, search_points
 from .surface import Surface
 
@@ -29,10 +31,12 @@ class Closest(NamedTuple):
     face: np.ndarray
     weights: np.ndarray
 
+    @checked
     def point(self, surface: Surface) -> np.ndarray:
         """The closest points `(n, D)`, m."""
         return self.interpolate(surface, surface.vertices)
 
+    @checked(values=finite())
     def interpolate(self, surface: Surface, values: np.ndarray) -> np.ndarray:
         """Values at the vertices `(nv, C)`, linear in the face, at the closest points: `(n, C)`."""
         return np.einsum("nk,nkc->nc", self.weights, values[surface.faces[self.face]])
@@ -45,6 +49,7 @@ class SurfaceIndex:
     larger than it are given further search points. It changes the cost, not the result.
     """
 
+    @checked(resolution=ENDLESS)
     def __init__(self, surface: Surface, resolution: float | None = None) -> None:
         self.surface = surface
         corner = surface.vertices[surface.faces]
@@ -56,6 +61,7 @@ class SurfaceIndex:
         self._first, self._owners = search.first, search.owners
         self._tree = cKDTree(search.points, leafsize=12)
 
+    @checked
     def query(self, points: np.ndarray) -> Closest:
         """The closest surface point of each of the points (n, D), m.
 
@@ -73,6 +79,7 @@ class SurfaceIndex:
             face[part], weights[part] = self._search(points[part])
         return self._result(points, face, weights)
 
+    @checked(points=finite())
     def on_faces(self, points: np.ndarray, face: np.ndarray) -> Closest:
         """The closest point of the given `face (n,)` to each of `points (n, D)`, m."""
         return self._result(points, face, self._faces.closest(points, face)[1])

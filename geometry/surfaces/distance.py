@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.ndimage import distance_transform_edt
 
+from geometry.arguments import ENDLESS, checked
 from geometry.grids.grid import Grid
 
 from .closest import Closest, SurfaceIndex
@@ -25,6 +26,7 @@ class GridDistance(NamedTuple):
     closest: Closest
 
 
+@checked(band=ENDLESS)
 def signed_distance(grid: Grid, surface: Surface, *, band: float | None = None) -> np.ndarray:
     """Distance to the surface at every node, m, float64 `shape`: positive inside the fluid, negative outside.
 
@@ -45,6 +47,7 @@ def signed_distance(grid: Grid, surface: Surface, *, band: float | None = None) 
     return distance_and_closest(grid, surface, band=band).distance
 
 
+@checked(band=ENDLESS)
 def distance_and_closest(grid: Grid, surface: Surface, *, band: float | None = None) -> GridDistance:
     """`signed_distance` together with the closest surface points that it found."""
     if grid.dimension != surface.dimension:

@@ -7,6 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
+from geometry.arguments import ENDLESS, checked, finite
+
 from .integers import region_number
 from .overlap import refuse_overlaps, united
 from .readers.obj import read_obj
@@ -15,6 +17,7 @@ from .readers.polygons import PolygonError, Polygons
 from .readers.stl import read_stl
 from .readers.vtk_poly import read_vtk_polygons
 from .repair import repaired
+from .shells import inner_sheet, refuse_shells
 from .surface import Surface, SurfaceError
 
 READERS: dict[str, Callable[[Path], Polygons]] = {
@@ -25,15 +28,18 @@ READERS: dict[str, Callable[[Path], Polygons]] = {
 }
 SUFFIXES = tuple(READERS)
 WRITTEN = (".stl", ".obj", ".ply")
+SHEETS = ("", "inner", "all")
 LARGEST = 1.0  # m; hearts are smaller, so a larger surface is in mm or cm
 
 
+@checked
 def read_surface(
     path: str | Path,
     *,
     scale: float = 1.0,
     mend: bool = True,
     unite: bool = False,
+    sheet: str = "",
     hole_region: int | Sequence[int] = 0,
 ) -> Surface:
     """The triangles of a STL, OBJ, PLY or VTP file as a closed outward surface.
@@ -43,6 +49,8 @@ def read_surface(
         scale: metres per unit of the file, 1e-3 for millimetres (these formats do not say).
         mend: merge seams, turn faces, close holes (`repaired`); STL always needs the merging.
         unite: closed bodies that overlap become one, with manifold3d; otherwise they are refused.
+        sheet: of a wall of finite thickness, "inner" takes the blood's surface, "all" leaves the material as what is
+            enclosed; with neither such a file is refused.
         hole_region: label of the faces that close holes; a sequence labels the longest holes, in order.
 
     Returns:
@@ -52,9 +60,11 @@ def read_surface(
     Raises:
         FileNotFoundError: there is no such file.
         SurfaceError: names the file, for other formats, files without triangles, surfaces larger than a metre,
-            faults that cannot be mended and bodies that overlap.
+            faults that cannot be mended, bodies that overlap and walls of finite thickness.
     """
     path = Path(path)
+    if sheet not in SHEETS:
+        raise SurfaceError(f"{path}: sheet must be one of {', '.join(SHEETS[1:])} or empty, not {sheet!r}")
     if not path.is_file():
         raise FileNotFoundError(f"{path}: there is no such file")
     if path.suffix.lower() not in READERS:
@@ -71,13 +81,15 @@ def read_surface(
             return surface
         whole = repaired(surface, hole_region=hole_region)
         if unite:
-            return united(whole)
-        refuse_overlaps(whole, _names_of_pieces(whole, surface, names))
-        return whole
+            whole = united(whole)
+        else:
+            refuse_overlaps(whole, _names_of_pieces(whole, surface, names))
+        return _sheet(whole, sheet, hole_region)
     except (SurfaceError, PolygonError) as fault:
         raise SurfaceError(f"{path}: {fault}") from fault
 
 
+@checked
 def write_surface(path: str | Path, surface: Surface, *, scale: float = 1.0) -> None:
     """Write a 3-D surface as STL, OBJ or PLY by suffix, in units of `scale` (m); PLY keeps the regions."""
     path = Path(path)
@@ -88,6 +100,7 @@ def write_surface(path: str | Path, surface: Surface, *, scale: float = 1.0) -> 
     mesh.export(path, file_type=path.suffix.lower()[1:])
 
 
+@checked(centre=finite(), radius=ENDLESS, normal=finite())
 def labelled(
     surface: Surface, region: int, *, centre: np.ndarray, radius: float, normal: np.ndarray | None = None
 ) -> Surface:
@@ -136,6 +149,15 @@ def _labels(region: np.ndarray | None, owner: np.ndarray) -> np.ndarray:
     if ((values != np.rint(values)) | (values < 0) | (values > 255)).any():
         raise SurfaceError(f"its face property of regions must hold whole numbers from 0 to 255, not {values.max():g}")
     return values.astype(np.uint8)
+
+
+def _sheet(whole: Surface, sheet: str, hole_region: int | Sequence[int]) -> Surface:
+    """The blood's surface: all that the file holds, or the inner sheet of a wall."""
+    if sheet == "inner":
+        return inner_sheet(whole, hole_region=hole_region)
+    if sheet != "all":
+        refuse_shells(whole)
+    return whole
 
 
 def _names_of_pieces(whole: Surface, raw: Surface, names: Sequence[str] | None) -> list[str]:

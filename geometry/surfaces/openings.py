@@ -11,6 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from geometry.arguments import checked
+from geometry.grids.given import numbers
+
+from .integers import region_number
 from .repair import rims
 from .surface import Surface, SurfaceError
 
@@ -50,6 +54,7 @@ class Opening:
         return 4.0 * np.pi * self.area / self.length**2
 
 
+@checked
 def openings(surface: Surface) -> list[Opening]:
     """The rims of an open surface in space, largest first; none where it is closed.
 
@@ -82,6 +87,7 @@ def _measured(rim: np.ndarray) -> tuple[np.ndarray, np.ndarray, float, float]:
     return centre, vector, float(np.linalg.norm(vector)), float(edge.sum())
 
 
+@checked
 def with_lids(surface: Surface, labels: Sequence[int] | Mapping[int, Sequence[float]] | None = None) -> Surface:
     """The surface closed by a lid over each opening, labelled; holes of a torn wall are closed as wall (region 0).
 
@@ -121,14 +127,17 @@ def _assigned(real: list[Opening], labels: Sequence[int] | Mapping[int, Sequence
         sizes = ", ".join(f"{1e4 * one.area:.3g} cm2 at {np.round(one.centre, 4).tolist()} m" for one in real)
         raise SurfaceError(f"{len(labels)} openings were labelled, but the surface has {len(real)}: {sizes or 'none'}")
     if not isinstance(labels, Mapping):
-        return dict(enumerate(labels))
+        return {place: region_number("with_lids: labels", label) for place, label in enumerate(labels)}
     result: dict[int, int] = {}
     for label, point in labels.items():
-        away = [float(np.linalg.norm(one.centre - np.asarray(point, float))) for one in real]
+        where = numbers(f"with_lids: the point of label {label}", point)
+        if len(where) != 3:
+            raise SurfaceError(f"with_lids: the point of label {label} must be three numbers (m), not {point!r:.60}")
+        away = [float(np.linalg.norm(one.centre - np.array(where))) for one in real]
         place = int(np.argmin(away))
         if place in result:
             raise SurfaceError(f"labels {result[place]} and {label} are nearest to the same opening: move their points")
-        result[place] = int(label)
+        result[place] = region_number("with_lids: labels", label)
     return result
 
 

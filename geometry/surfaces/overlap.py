@@ -139,5 +139,5 @@ def _pierced(ends: np.ndarray, corners: np.ndarray) -> bool:
         turned = np.cross(offset, first)
         v = (along * turned).sum(-1) / scale
         t = (second * turned).sum(-1) / scale
-    inside = (u > CLEAR) & (v > CLEAR) & (u + v < 1 - CLEAR) & (t > CLEAR) & (t < 1 - CLEAR)
+        inside = (u > CLEAR) & (v > CLEAR) & (u + v < 1 - CLEAR) & (t > CLEAR) & (t < 1 - CLEAR)
     return bool((inside & ~parallel).any())

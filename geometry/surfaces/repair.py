@@ -9,11 +9,14 @@ from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components
 from scipy.spatial import cKDTree
 
+from geometry.arguments import checked
+
 from .holes import least_area_triangles, star_shaped
 from .integers import region_number
 from .surface import Surface, SurfaceError, ridges_of
 
 
+@checked
 def repaired(surface: Surface, *, merge: float | None = None, hole_region: int | Sequence[int] = 0) -> Surface:
     """The closed, consistently numbered, outward surface that a faulty one was meant to be.
 

@@ -18,6 +18,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import Delaunay, QhullError
 
+from geometry.arguments import ANY, ENDLESS, NOT_NEGATIVE, between, checked, finite
 from geometry.grids.grid import Grid
 
 from .surface import Surface, SurfaceError
@@ -25,8 +26,10 @@ from .surface import Surface, SurfaceError
 # qhull triangulates points on a common sphere, as on a grid, in pieces without volume. Moving the points by
 # this part of their spacing, for the triangulation only, makes it unique and all its pieces regular.
 JOGGLE = 1e-4
+MOST_PASSES = 10_000  # of a filter; nothing of a surface is left long before
 
 
+@checked(alpha=ANY)
 def surface_from_points(points: np.ndarray, *, alpha: float) -> Surface:
     """The outer surface of a cloud of points `(n, D)`, m, concave down to `alpha` (m).
 
@@ -39,6 +42,8 @@ def surface_from_points(points: np.ndarray, *, alpha: float) -> Surface:
     points = np.asarray(points, np.float64)
     if points.ndim != 2 or points.shape[1] not in (2, 3) or not np.isfinite(points).all():
         raise SurfaceError(f"surface_from_points: points must be finite (n, 2) or (n, 3), not {points.shape}")
+    if len(points) <= points.shape[1]:
+        raise SurfaceError(f"surface_from_points: {len(points)} points cannot be triangulated: too few")
     if not alpha > 0:
         raise SurfaceError(f"surface_from_points: alpha must be a positive length (m), not {alpha}")
     mesh = _delaunay(points)
@@ -48,6 +53,7 @@ def surface_from_points(points: np.ndarray, *, alpha: float) -> Surface:
     return mesh.surface(keep)
 
 
+@checked(alpha=ENDLESS, smoothing=between(0, MOST_PASSES))
 def surface_from_mask(mask: np.ndarray, grid: Grid, *, alpha: float = np.inf, smoothing: int = 0) -> Surface:
     """The surface of a segmentation `mask` (*shape), True inside: of its largest connected part, filled.
 
@@ -68,6 +74,7 @@ def surface_from_mask(mask: np.ndarray, grid: Grid, *, alpha: float = np.inf, sm
     return taubin(surface, smoothing) if smoothing else surface
 
 
+@checked(velocity=finite(), threshold=NOT_NEGATIVE, alpha=ENDLESS, smoothing=between(0, MOST_PASSES))
 def surface_from_velocity(
     velocity: np.ndarray,
     grid: Grid,
@@ -83,6 +90,8 @@ def surface_from_velocity(
     as `surface_from_mask`.
     """
     velocity = np.asarray(velocity, np.float64)
+    if velocity.ndim <= grid.dimension:
+        raise SurfaceError(f"surface_from_velocity: the velocity {velocity.shape} must have an axis of components")
     speed = np.sqrt((velocity**2).sum(axis=-1 - grid.dimension))
     if speed.shape[-grid.dimension :] != grid.shape or speed.ndim > grid.dimension + 1:
         raise SurfaceError(f"surface_from_velocity: the velocity {velocity.shape} does not fit the grid {grid.shape}")
@@ -91,6 +100,7 @@ def surface_from_velocity(
     return surface_from_mask(mask, grid, alpha=alpha, smoothing=smoothing)
 
 
+@checked(passes=between(0, MOST_PASSES))
 def taubin(surface: Surface, passes: int, *, shrink: float = 0.5, inflate: float = 0.53) -> Surface:
     """Taubin 1995, "A signal processing approach to fair surface design": smooth, then inflate, each pass."""
     count = len(surface.vertices)

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from geometry.arguments import ENDLESS, checked
 from geometry.grids.given import numbers
 
 from .surface import Surface, SurfaceError
@@ -18,6 +19,7 @@ from .surface import Surface, SurfaceError
 _MOST = 20_000
 
 
+@checked
 def ellipsoid(semi_axes: Sequence[float], spacing: float, centre: Sequence[float] = (0.0, 0.0, 0.0)) -> Surface:
     """An ellipsoid, semi-axes (m) along x, y, z, around `centre`; `spacing` (m) between its vertices."""
     axes = _positive("ellipsoid: semi_axes", semi_axes, 3)
@@ -28,6 +30,7 @@ def ellipsoid(semi_axes: Sequence[float], spacing: float, centre: Sequence[float
     return unit.moved(unit.vertices * axes + _numbers("ellipsoid: centre", centre, 3))
 
 
+@checked
 def tube(radius: float, length: float, spacing: float) -> Surface:
     """A pipe along z from 0 to `length` (m): wall (region 0), inlet at z = 0 (1), outlet at the end (2)."""
     _positive("tube: radius, length, spacing", [radius, length, spacing], 3)
@@ -40,6 +43,7 @@ def tube(radius: float, length: float, spacing: float) -> Surface:
     return revolved(np.stack([r, z], axis=1), spacing, region)
 
 
+@checked
 def box(lower: Sequence[float], upper: Sequence[float], spacing: float) -> Surface:
     """A box between two corners (m), its sides cut at about `spacing`; one region, the wall."""
     first = _numbers("box: lower", lower, 3)
@@ -66,6 +70,7 @@ def box(lower: Sequence[float], upper: Sequence[float], spacing: float) -> Surfa
     return Surface(first + lattice / count * size, place.reshape(-1)[np.concatenate(faces)])
 
 
+@checked
 def ellipse(semi_axes: Sequence[float], spacing: float, centre: Sequence[float] = (0.0, 0.0)) -> Surface:
     """An ellipse in the plane, semi-axes (m) along x and y, as a closed polyline."""
     axes = _positive("ellipse: semi_axes", semi_axes, 2)
@@ -73,6 +78,7 @@ def ellipse(semi_axes: Sequence[float], spacing: float, centre: Sequence[float] 
     return polygon(ellipse_rim(axes, spacing) + _numbers("ellipse: centre", centre, 2), np.inf)
 
 
+@checked(spacing=ENDLESS)
 def polygon(corners: np.ndarray, spacing: float) -> Surface:
     """A closed polyline through `corners (n, 2)`, m, counter-clockwise, cut at about `spacing`."""
     corners = np.asarray(corners, np.float64)
@@ -100,6 +106,7 @@ def ellipse_rim(semi_axes: Sequence[float] | np.ndarray, spacing: float) -> np.n
     return np.stack([semi_axes[0] * np.cos(angle), semi_axes[1] * np.sin(angle)], axis=1)
 
 
+@checked
 def revolved(profile: np.ndarray, spacing: float, region: np.ndarray | int = 0) -> Surface:
     """The body whose outline `profile (n, 2)` of (radius, z), m, starts and ends on the axis z.
 

@@ -14,6 +14,8 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from geometry.arguments import checked
+
 from .integers import narrowed
 from .winding import winding_number
 
@@ -25,6 +27,7 @@ class SurfaceError(ValueError):
     """A surface that cannot bound a domain: malformed, open or inside out."""
 
 
+@checked
 @dataclass(frozen=True, eq=False)
 class Surface:
     """Faces between vertices, in space (D = 3) or in a plane (D = 2).
@@ -186,6 +189,7 @@ class Surface:
                 result.__dict__[name] = self.__dict__[name]
         return result
 
+    @checked
     def part(self, region: int) -> np.ndarray:
         """Numbers of the faces that carry a region label."""
         return np.flatnonzero(self.region == region)

@@ -10,21 +10,44 @@ from __future__ import annotations
 
 import numpy as np
 
+from geometry.arguments import checked, finite
 from geometry.grids.grid import Grid
 
 CHUNK = 4_000_000  # point-face pairs at a time, about 0.5 GB of scratch memory
 
 
+@checked(vertices=finite(), points=finite())
 def winding_number(vertices: np.ndarray, faces: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Winding number of a surface `(nv, D), (nf, D)` around points `(n, D)`: float `(n,)`; D is 2 or 3.
 
     Cost is points times faces: meant for few points or as an independent check.
+
+    Raises:
+        ValueError: shapes that do not fit each other, values that are not finite, faces of vertices there are not.
     """
+    faces = _checked_faces("winding_number", vertices, faces)
+    if points.ndim != 2 or points.shape[1] != vertices.shape[1]:
+        wanted = f"(n, {vertices.shape[1]}), as the vertices"
+        raise ValueError(f"winding_number: points must be {wanted}, not {points.shape}")
     rows = max(1, CHUNK // max(len(faces), 1))
     angle = _plane_angle if points.shape[1] == 2 else _solid_angle
     corners = vertices[faces]
     chunks = [angle(corners, points[start : start + rows]) for start in range(0, len(points), rows)]
     return np.concatenate(chunks) if chunks else np.zeros(0)
+
+
+def _checked_faces(name: str, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """The faces as whole numbers, each of a vertex that there is."""
+    if vertices.ndim != 2 or vertices.shape[1] not in (2, 3):
+        raise ValueError(f"{name}: vertices must be (nv, 2) or (nv, 3), not {vertices.shape}")
+    if faces.ndim != 2 or faces.shape[1] != vertices.shape[1]:
+        raise ValueError(f"{name}: faces must be (nf, {vertices.shape[1]}), as the vertices, not {faces.shape}")
+    if faces.dtype.kind not in "iu":
+        raise TypeError(f"{name}: faces must hold whole numbers, not {faces.dtype}")
+    if faces.size and (faces.min() < 0 or faces.max() >= len(vertices)):
+        there = f"0 to {len(vertices) - 1}, not {faces.min()} to {faces.max()}"
+        raise ValueError(f"{name}: faces must number vertices {there}")
+    return faces
 
 
 def _plane_angle(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
@@ -42,6 +65,7 @@ def _solid_angle(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
     return np.arctan2(above, below).sum(1) / (2 * np.pi)
 
 
+@checked(vertices=finite())
 def grid_winding(grid: Grid, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Winding number at every node of a grid: int32 `shape`.
 
@@ -49,8 +73,14 @@ def grid_winding(grid: Grid, vertices: np.ndarray, faces: np.ndarray) -> np.ndar
     face; a face that is left outwards counts +1 for all nodes before it. The lines are moved aside by 1e-7 of
     the spacing, so that they do not meet the vertices and edges of meshes that sit on the nodes; nodes closer
     to the surface than that may fall on either side.
+
+    Raises:
+        ValueError: shapes that do not fit each other, values that are not finite, faces of vertices there are not.
     """
+    faces = _checked_faces("grid_winding", vertices, faces)
     dimension = grid.dimension
+    if vertices.shape[1] != dimension:
+        raise ValueError(f"grid_winding: vertices must be (nv, {dimension}), as the grid, not {vertices.shape}")
     lateral = (
         np.asarray(grid.origin[:-1])
         + 1e-7 * np.asarray(grid.spacing[:-1]) * np.array([0.8191, 0.5736])[: dimension - 1]

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from geometry.arguments import checked
 from geometry.grids.grid import Grid
 from geometry.recordings.recording import Recording, Wall
 from geometry.surfaces.surface import Surface
@@ -19,6 +20,7 @@ from geometry.surfaces.surface import Surface
 from .mesh import ventricle_surface
 
 
+@checked
 @dataclass(frozen=True)
 class Beat:
     """The volume over one beat, as a fraction of the end-diastolic one, and when the valves are open.
@@ -45,10 +47,12 @@ class Beat:
         if self.ejection[1] > min(self.early[0], self.late[0]):
             raise ValueError("Beat: filling must start after ejection has ended")
 
+    @checked
     def volume(self, t: float) -> float:
         """V(t) / V(0), periodic."""
         return 1 + self._sum(t, lambda x: x - np.sin(2 * np.pi * x) / (2 * np.pi))[0]
 
+    @checked
     def rate(self, t: float) -> float:
         """d/dt of `volume`, 1/s."""
         return self._sum(t, lambda x: 1 - np.cos(2 * np.pi * x))[1]
@@ -68,6 +72,7 @@ class Beat:
         return value, rate
 
 
+@checked
 @dataclass(frozen=True)
 class Ventricle:
     """The shape at end diastole (m) and its beat. Regions: 0 wall, 1 mitral inlet, 2 aortic outlet.
@@ -126,10 +131,12 @@ class Ventricle:
         a, c = self.semi_major, self.offset
         return np.pi * self.semi_minor**2 * (self.length - (a**3 + c**3) / (3 * a**2))
 
+    @checked
     def volume(self, t: float) -> float:
         """Exact enclosed volume at time `t` (s), m^3."""
         return self.end_diastolic_volume * self.beat.volume(t)
 
+    @checked
     def volume_rate(self, t: float) -> float:
         """Exact dV/dt at time `t`, m^3/s."""
         return self.end_diastolic_volume * self.beat.rate(t)
@@ -144,16 +151,19 @@ class Ventricle:
         k = self.axial_share
         return self.scales(t) * np.array([(1 - k) / 2, (1 - k) / 2, k]) * self.beat.rate(t) / self.beat.volume(t)
 
+    @checked
     def wall_velocity(self, points: np.ndarray, t: float) -> np.ndarray:
         """The affine wall motion's velocity (m/s) at points `(n, 3)` of the wall at time `t`."""
         return points * (self.scale_rates(t) / self.scales(t))
 
+    @checked
     def contains(self, points: np.ndarray, t: float) -> np.ndarray:
         """Whether points `(n, 3)`, m, lie inside at time `t`, bool `(n,)`; exact."""
         x, y, z = (np.asarray(points) / self.scales(t)).T
         radial = (x * x + y * y) / self.semi_minor**2
         return (z < 0) & (radial + ((z + self.offset) / self.semi_major) ** 2 < 1)
 
+    @checked
     def rims(self, count: int) -> tuple[np.ndarray, np.ndarray]:
         """Points on the mitral and the aortic rim at end diastole, `(count, 2)` each, m."""
         angle = 2 * np.pi * np.arange(count) / count
@@ -161,11 +171,13 @@ class Ventricle:
         mitral = np.asarray(self.mitral_centre) + circle * np.asarray(self.mitral_semi_axes)
         return mitral, np.asarray(self.aortic_centre) + circle * self.aortic_radius
 
+    @checked
     def surface(self, spacing: float, t: float = 0.0) -> Surface:
         """The triangulated surface at time `t`, vertices about `spacing` (m) apart at end diastole."""
         reference = ventricle_surface(self, spacing)
         return reference.moved(reference.vertices * self.scales(t))
 
+    @checked
     def wall(self, time: np.ndarray, spacing: float) -> Wall:
         """The moving wall at times `(T,)`, s, with the exact velocity of its vertices."""
         reference = ventricle_surface(self, spacing)
@@ -173,6 +185,7 @@ class Ventricle:
         velocity = np.stack([reference.vertices * self.scale_rates(t) for t in time])
         return Wall(vertices, reference.faces, reference.region, velocity)
 
+    @checked
     def recording(
         self,
         time: Sequence[float] | np.ndarray,

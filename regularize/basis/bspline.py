@@ -12,9 +12,12 @@ from functools import lru_cache
 import numpy as np
 import torch
 
+from regularize.arguments import Rule, between, checked
 from regularize.errors import InvalidInput
 
 DEGREES = (1, 2, 3, 4, 5)
+MOST_DISTANCE = 1e6  # of a place in its interval, whose fifth power float32 still holds
+NEAR = Rule(f"finite and within {MOST_DISTANCE:g} of 0", lambda t: bool((t.abs() <= MOST_DISTANCE).all()))
 MOST_ORDER = 6  # of derivatives: one more than the highest degree has is 0
 
 
@@ -65,16 +68,20 @@ def derivative_pieces(degree: int, order: int) -> np.ndarray:
     return table
 
 
+@checked(t=NEAR, degree=between(DEGREES[0], DEGREES[-1]), order=between(0, MOST_ORDER))
 def basis(t: torch.Tensor, degree: int, order: int = 0) -> torch.Tensor:
     """Values (..., degree + 1) of the non-zero functions, or of their order-th derivative, at t (...).
 
     Raises:
-        InvalidInput: t is no tensor of real numbers, or there is no such degree or derivative.
+        InvalidInput: t is no tensor of finite real numbers, or there is no such degree or derivative.
     """
-    if not isinstance(t, torch.Tensor) or not t.is_floating_point():
-        raise InvalidInput(f"t is {getattr(t, 'dtype', type(t).__name__)}: it must be a tensor of real numbers")
-    if not (isinstance(order, int) and 0 <= order <= MOST_ORDER and isinstance(degree, int)):
-        raise InvalidInput(f"degree {degree!r}, order {order!r}: whole numbers, the order from 0 to {MOST_ORDER}")
+    if not t.is_floating_point():
+        raise InvalidInput(f"basis: t is of {t.dtype}: it must hold real numbers")
+    return basis_at(t, degree, order)
+
+
+def basis_at(t: torch.Tensor, degree: int, order: int) -> torch.Tensor:
+    """`basis`, of arguments that are known to be sound."""
     table = torch.as_tensor(derivative_pieces(degree, order).copy(), dtype=t.dtype, device=t.device)
     powers = torch.stack([t**k for k in range(table.shape[1])], dim=-1)
     return powers @ table.T
@@ -85,6 +92,6 @@ def interval_gram(degree: int, first: int, second: int) -> np.ndarray:
     """(degree + 1, degree + 1): exact integral over one interval of the products B_i^(first) B_j^(second)."""
     nodes, weights = np.polynomial.legendre.leggauss(degree + 1)
     t = torch.as_tensor((nodes + 1) / 2)
-    a = basis(t, degree, first).numpy()
-    b = basis(t, degree, second).numpy()
+    a = basis_at(t, degree, first).numpy()
+    b = basis_at(t, degree, second).numpy()
     return np.einsum("q,qi,qj->ij", weights / 2, a, b)

@@ -8,13 +8,15 @@ from functools import reduce
 import numpy as np
 import torch
 
+from regularize.arguments import checked
 from regularize.errors import InvalidInput
 
-from .bspline import DEGREES, basis
+from .bspline import DEGREES, basis_at
 
 MOST_NODES = 2**31 - 1  # places of coefficients are int32 in compiled code
 
 
+@checked
 @dataclass(frozen=True)
 class Knots:
     """Uniform knots in A axes (space, and time as a last axis), all tuples in the order x, y, (z), (t).
@@ -50,12 +52,16 @@ class Knots:
             )
 
     @classmethod
+    @checked
     def covering(
         cls, lower: Sequence[float], upper: Sequence[float], spacing: Sequence[float], degree: int = 3
     ) -> "Knots":
         """The smallest grid of the given spacing around the box, centred on it."""
-        if min(spacing) <= 0:
-            raise InvalidInput(f"spacing is {tuple(spacing)}: knot distances must be positive")
+        if not len(lower) == len(upper) == len(spacing) or not len(spacing):
+            counts = f"{len(lower)}, {len(upper)} and {len(spacing)}"
+            raise InvalidInput(f"lower, upper and spacing must have one number per axis each, not {counts}")
+        if not all(0 < h < math.inf for h in spacing) or not all(map(math.isfinite, (*lower, *upper))):
+            raise InvalidInput(f"spacing is {tuple(spacing)}: knot distances must be positive, and all finite")
         # The small slack keeps a box of exactly k intervals from getting k + 1 of them by round-off.
         cells = tuple(max(1, _ceil((b - a) / h - 1e-9)) for a, b, h in zip(lower, upper, spacing, strict=True))
         origin = tuple((a + b - n * h) / 2 for a, b, h, n in zip(lower, upper, spacing, cells, strict=True))
@@ -86,6 +92,7 @@ class Knots:
         """Coefficients that one point touches: (degree + 1) ** axes."""
         return (self.degree + 1) ** self.axes
 
+    @checked
     def inside(self, points: torch.Tensor) -> torch.Tensor:
         """(n,) bool: which points (n, A) lie in the box, its faces included up to round-off."""
         u = self._scaled(points)
@@ -94,6 +101,7 @@ class Knots:
         upper = torch.tensor(self.cells, dtype=u.dtype, device=u.device)
         return ((u >= -slack) & (u <= upper + slack)).all(dim=-1)
 
+    @checked
     def locate(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Cell index (n, A) int64 and local coordinate (n, A) in [0, 1] of points (n, A).
 
@@ -113,7 +121,7 @@ class Knots:
         orders = (0,) * self.axes if orders is None else tuple(orders)
         product = torch.ones(len(t), 1, dtype=t.dtype, device=t.device)
         for axis in reversed(range(self.axes)):
-            values = basis(t[:, axis], self.degree, orders[axis]) / self.spacing[axis] ** orders[axis]
+            values = basis_at(t[:, axis], self.degree, orders[axis]) / self.spacing[axis] ** orders[axis]
             product = (product[:, :, None] * values[:, None, :]).flatten(1)
         return product
 

@@ -26,7 +26,7 @@ def available(device: torch.device) -> bool:
 
 
 def triton_band(system: System, ordering: Ordering) -> torch.Tensor:
-    """As :func:`regularize.assembly.reference_band`; ImportError where triton is not installed."""
+    """As :func:`regularize.rows.assembly.reference_band`; ImportError where triton is not installed."""
     band = empty_band(system, ordering)
     for block in system.blocks:
         if isinstance(block, CellRows):

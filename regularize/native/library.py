@@ -107,7 +107,7 @@ def _size(band: torch.Tensor) -> tuple[ctypes.c_void_p, ctypes.c_int64, ctypes.c
 
 
 def factorise(band: torch.Tensor, reach: torch.Tensor) -> bool:
-    """As :func:`regularize.cholesky.factorise`."""
+    """As :func:`regularize.solvers.cholesky.factorise`."""
     lib = _loaded()
     check_band(band, reach)
     lib.spline_set_threads(torch.get_num_threads())
@@ -175,7 +175,7 @@ class PackedSystem:
         return other
 
     def band(self) -> torch.Tensor:
-        """As :func:`regularize.assembly.reference_band`."""
+        """As :func:`regularize.rows.assembly.reference_band`."""
         band = empty_band(self.system, self.ordering)
         blocks = (_Rows * len(self.rows))(*self.rows)
         self.lib.spline_gram(

@@ -26,3 +26,23 @@ def check_real(name: str, values: torch.Tensor, shapes: Collection[tuple[int, ..
     if shapes is not None and tuple(values.shape) not in shapes:
         allowed = " or ".join(str(shape) for shape in shapes)
         raise InvalidInput(f"{name} has the shape {tuple(values.shape)}: it must be {allowed}")
+
+
+def dense(name: str, values: torch.Tensor) -> torch.Tensor:
+    """A dense tensor that holds real numbers, of whatever torch takes for one.
+
+    Args:
+        name: what it is called.
+        values: a tensor, or what torch makes one of.
+
+    Raises:
+        InvalidInput: it is something else.
+    """
+    try:
+        tensor = torch.as_tensor(values)
+    except (TypeError, ValueError, RuntimeError) as fault:
+        raise InvalidInput(f"{name} must be a tensor, not {type(values).__name__}") from fault
+    if tensor.layout != torch.strided or tensor.device.type == "meta" or tensor.is_complex():
+        kind = f"{tensor.layout} of {tensor.dtype} on '{tensor.device}'"
+        raise InvalidInput(f"{name} must be a dense tensor of real numbers, not {kind}")
+    return tensor

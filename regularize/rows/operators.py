@@ -12,6 +12,7 @@ from typing import Protocol
 
 import torch
 
+from regularize.arguments import checked
 from regularize.basis.knots import Knots
 from regularize.errors import InvalidInput
 
@@ -85,6 +86,7 @@ def at_points(block: "RowBlock") -> PointRows:
 class VectorRows(PointRows):
     """Rows w_ik v_k(x_i) = w_ik target_ik, one per point and component (the matrix S of Grønli 2017, eq. 3.7)."""
 
+    @checked
     def __init__(self, knots: Knots, points: torch.Tensor, target: torch.Tensor, weight: torch.Tensor) -> None:
         for name, values in (("points", points), ("target", target), ("weight", weight)):
             check_real(name, values)
@@ -191,6 +193,7 @@ class _CoupledRows(PointRows):
 class DirectionRows(_CoupledRows):
     """Rows w_i d_i . v(x_i): wall normals (Grønli 2017, eq. 3.21), Doppler beams. direction (n, C), target (n,)."""
 
+    @checked
     def __init__(
         self,
         knots: Knots,
@@ -219,6 +222,7 @@ class DirectionRows(_CoupledRows):
 class DivergenceRows(_CoupledRows):
     """Rows w_i div v(x_i) = 0, derivatives per metre (Grønli 2017, eq. 3.13)."""
 
+    @checked
     def __init__(self, knots: Knots, points: torch.Tensor, components: int, weight: torch.Tensor) -> None:
         check_real("points", points)
         super().__init__(knots, points, components, points.new_zeros(points.shape[:1]), weight)
@@ -237,6 +241,7 @@ class CellRows:
     coupling them; its Gram matrix is the integral over one cell (see ``penalties``).
     """
 
+    @checked
     def __init__(self, knots: Knots, cells: torch.Tensor, factor: torch.Tensor, components: int) -> None:
         tail = () if factor.ndim == 2 else (components,)
         if factor.shape[1:] != (knots.local_size, *tail):
@@ -276,6 +281,7 @@ class CellRows:
 class System:
     """Stacked row blocks with damping: minimise |A c - b|^2 + damping^2 |c|^2 (Grønli 2017, eq. 3.22)."""
 
+    @checked
     def __init__(self, knots: Knots, components: int, blocks: Sequence[RowBlock], damping: float) -> None:
         if not blocks:
             raise InvalidInput("the system has no rows: give samples, walls or penalties")

@@ -8,11 +8,14 @@ from collections.abc import Callable
 
 import torch
 
+from regularize.arguments import checked
+
 from .operators import CellRows, RowBlock, System, VectorRows, at_points
 
 Apply = Callable[[torch.Tensor], torch.Tensor]
 
 
+@checked
 def sparse_matrix(system: System) -> torch.Tensor:
     """The rows of ``system`` as one float64 CSR matrix (rows, unknowns), weights included."""
     rows, columns, values, offset = [], [], [], 0
@@ -30,6 +33,7 @@ def sparse_matrix(system: System) -> torch.Tensor:
         return torch.sparse_coo_tensor(index, torch.cat(values), shape).to_sparse_csr()
 
 
+@checked
 def sparse_operators(system: System) -> tuple[Apply, Apply]:
     """matvec and rmatvec of the stored matrix and transpose, in the precision of their argument."""
     forward = sparse_matrix(system)

@@ -6,6 +6,8 @@ import torch
 
 from regularize.errors import InvalidInput
 
+from .given import dense
+
 
 @dataclass(frozen=True)
 class WallRows:
@@ -30,21 +32,24 @@ class WallRows:
     no_slip: torch.Tensor = None  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
-        points = torch.as_tensor(self.points)
+        points = dense("wall points", self.points)
         if points.ndim != 2 or len(points) == 0:
             raise InvalidInput(f"wall points have shape {tuple(points.shape)}: expected (n, D) with n >= 1")
         if not points.is_floating_point():
             points = points.double()
         convert = {"points": points}
         for name in ("normals", "velocity"):
-            value = torch.as_tensor(getattr(self, name)).to(points)
+            value = dense(f"wall {name}", getattr(self, name)).to(points)
             # points may carry the time as one more column than the vectors have
             if value.ndim != 2 or len(value) != len(points) or points.shape[1] - value.shape[1] not in (0, 1):
                 raise InvalidInput(f"wall {name} have shape {tuple(value.shape)}: expected {tuple(points.shape)}")
             convert[name] = value
+        if convert["velocity"].shape != convert["normals"].shape:
+            shapes = f"{tuple(convert['normals'].shape)} and {tuple(convert['velocity'].shape)}"
+            raise InvalidInput(f"wall normals and velocity have shapes {shapes}: they must agree")
         count = points.shape[:1]
-        weight = torch.ones_like(points[:, 0]) if self.weight is None else torch.as_tensor(self.weight).to(points)
-        slip = torch.ones(count, dtype=torch.bool) if self.no_slip is None else torch.as_tensor(self.no_slip)
+        weight = torch.ones_like(points[:, 0]) if self.weight is None else dense("wall weight", self.weight).to(points)
+        slip = torch.ones(count, dtype=torch.bool) if self.no_slip is None else dense("wall no_slip", self.no_slip)
         convert["weight"], convert["no_slip"] = weight, slip.bool().to(points.device)
         for name in ("weight", "no_slip"):
             if convert[name].shape != count:

@@ -7,6 +7,7 @@ import torch
 
 from regularize.basis.knots import Knots
 from regularize.errors import InvalidInput
+from regularize.rows.given import dense
 from regularize.solvers.interface import CholeskyFactor, Solution
 from regularize.statistics.likelihood import Choice
 from regularize.statistics.posterior import Posterior
@@ -108,12 +109,16 @@ class SplineField:
         return self(points, outside).T.reshape(self.components, *shape)
 
     def _checked(self, points: torch.Tensor) -> torch.Tensor:
-        points = torch.as_tensor(points)
+        points = dense("points", points)
         if points.ndim != 2 or points.shape[1] != self.knots.axes:
             raise InvalidInput(f"points have shape {tuple(points.shape)}: expected (n, {self.knots.axes})")
+        if not bool(torch.isfinite(points).all()):
+            raise InvalidInput("points must be finite: leave out those that are not")
         return points.to(self.coefficients)
 
     def _evaluate(self, points: torch.Tensor, orders: list, outside: float) -> list[torch.Tensor]:
+        if not isinstance(outside, int | float):
+            raise InvalidInput(f"outside is {outside!r:.60}: it must be a number, as nan or 0.0")
         points = self._checked(points)
         supported = self.supported(points)
         cell, t = self.knots.locate(points)

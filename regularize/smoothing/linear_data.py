@@ -10,11 +10,13 @@ from dataclasses import dataclass
 
 import torch
 
+from regularize.arguments import checked, finite
 from regularize.errors import InvalidInput
 
 from .field import SplineField
 
 
+@checked(points=finite(None, None), rows=finite(None, None), value=finite(None), sigma=finite(None))
 @dataclass(frozen=True)
 class LinearData:
     """K numbers, the k-th the sum over the points of group k of row . velocity.
@@ -25,6 +27,9 @@ class LinearData:
         group: (n,) int64, from 0 to K - 1.
         value: (K,), as measured.
         sigma: (K,), standard deviations.
+
+    Raises:
+        InvalidInput: shapes that disagree, groups without a number, values that are not finite or negative deviations.
     """
 
     points: torch.Tensor
@@ -33,12 +38,26 @@ class LinearData:
     value: torch.Tensor
     sigma: torch.Tensor
 
+    def __post_init__(self) -> None:
+        count, numbers = len(self.points), len(self.value)
+        if len(self.rows) != count or self.group.shape != (count,) or self.sigma.shape != self.value.shape:
+            shapes = [tuple(getattr(self, name).shape) for name in ("points", "rows", "group", "value", "sigma")]
+            raise InvalidInput(f"LinearData: points, rows, group, value and sigma of {shapes} do not fit each other")
+        if bool((self.sigma < 0).any()):
+            raise InvalidInput(f"LinearData: sigma must be 0 or more, not {self.sigma.tolist()}")
+        if self.group.dtype != torch.int64:
+            raise InvalidInput(f"LinearData: group must be of torch.int64, not {self.group.dtype}")
+        if count and (int(self.group.min()) < 0 or int(self.group.max()) >= numbers):
+            places = f"{int(self.group.min())} to {int(self.group.max())}"
+            raise InvalidInput(f"LinearData: group numbers the {numbers} values from 0 on, but runs from {places}")
+
     def of(self, field: SplineField) -> torch.Tensor:
         """(K,) what a field says they are."""
         each = (self.rows.double() * field(self.points, outside=0.0).double()).sum(1)
         return torch.zeros(len(self.value), dtype=torch.float64).index_add(0, self.group, each)
 
 
+@checked
 def with_linear_data(field: SplineField, data: LinearData) -> SplineField:
     """The field that the numbers make of a fit, each weighed by its error against the fit's own.
 
@@ -49,12 +68,12 @@ def with_linear_data(field: SplineField, data: LinearData) -> SplineField:
         data: the numbers.
 
     Raises:
-        InvalidInput: the field keeps no posterior, or a deviation is negative or not finite.
+        InvalidInput: the field keeps no posterior, or the rows are of other components.
     """
     if field.posterior is None or field.factor is None:
         raise InvalidInput("linear data need the posterior of the fit: fit it with uncertainty=True")
-    if not bool((torch.isfinite(data.sigma) & (data.sigma >= 0)).all()):
-        raise InvalidInput(f"deviations of linear data must be finite and >= 0, not {data.sigma.tolist()}")
+    if data.rows.shape[1] != field.components:
+        raise InvalidInput(f"linear data of {data.rows.shape[1]} components for a field of {field.components}")
     ordering, posterior = field.posterior.ordering, field.posterior
     supported = field.supported(data.points)
     cell, t = field.knots.locate(data.points[supported].double())

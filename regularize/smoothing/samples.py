@@ -11,6 +11,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from regularize.basis.knots import Knots
 from regularize.errors import InvalidInput
+from regularize.rows.given import dense
 from regularize.rows.walls import WallRows
 from regularize.statistics.likelihood import Choice
 
@@ -47,10 +48,10 @@ class FitData:
         beam: torch.Tensor | None = None,
     ) -> "FitData":
         """Check every array (InvalidInput names the first rule broken) and drop samples of zero weight."""
-        dtype = _dense("velocity", velocity).dtype
+        dtype = dense("velocity", velocity).dtype
         points, velocity, weight, beam = _checked_samples(points, velocity, weight, beam)
         wall = None if wall is None else wall.to(points.dtype, points.device)
-        extra = None if divergence_points is None else _dense("divergence_points", divergence_points).to(points)
+        extra = None if divergence_points is None else dense("divergence_points", divergence_points).to(points)
         others = {"wall points": None if wall is None else wall.points, "divergence_points": extra}
         for name, more in others.items():
             if more is not None and (more.ndim != 2 or more.shape[1] != points.shape[1]):
@@ -126,18 +127,6 @@ class FitData:
             return 0.0
 
 
-def _dense(name: str, values: torch.Tensor) -> torch.Tensor:
-    """A tensor that holds numbers, of whatever torch takes for one."""
-    try:
-        tensor = torch.as_tensor(values)
-    except (TypeError, ValueError, RuntimeError) as fault:
-        raise InvalidInput(f"{name} must be a tensor, not {type(values).__name__}") from fault
-    if tensor.layout != torch.strided or tensor.device.type == "meta" or tensor.is_complex():
-        kind = f"{tensor.layout} of {tensor.dtype} on '{tensor.device}'"
-        raise InvalidInput(f"{name} must be a dense tensor of real numbers, not {kind}")
-    return tensor
-
-
 def _checked_samples(
     points: torch.Tensor,
     velocity: torch.Tensor,
@@ -145,14 +134,14 @@ def _checked_samples(
     beam: torch.Tensor | None,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor | None]:
     # strong penalties amplify rounding by the condition number: rows are always built in float64
-    velocity = _dense("velocity", velocity).double()
-    points = _dense("points", points).to(velocity)
+    velocity = dense("velocity", velocity).double()
+    points = dense("points", points).to(velocity)
     shapes = f"points have shape {tuple(points.shape)} and velocity {tuple(velocity.shape)}"
     if velocity.ndim != 2 or velocity.shape[1] not in (2, 3) or points.ndim != 2:
         raise InvalidInput(f"{shapes}: velocity must be (n, D) with D = 2 or 3")
     if len(points) != len(velocity) or points.shape[1] - velocity.shape[1] not in (0, 1):
         raise InvalidInput(f"{shapes}: points must be (n, D), or (n, D + 1) with the time last")
-    weight = torch.ones_like(points[:, 0]) if weight is None else _dense("weight", weight).to(velocity)
+    weight = torch.ones_like(points[:, 0]) if weight is None else dense("weight", weight).to(velocity)
     if weight.shape != points.shape[:1]:
         raise InvalidInput(f"weight has shape {tuple(weight.shape)}: expected ({len(points)},)")
     if not bool(((weight >= 0) & torch.isfinite(weight)).all()):
@@ -167,7 +156,7 @@ def _checked_samples(
 
 
 def _checked_beam(beam: torch.Tensor, keep: torch.Tensor, velocity: torch.Tensor) -> torch.Tensor:
-    beam = _dense("beam", beam).to(velocity)
+    beam = dense("beam", beam).to(velocity)
     if beam.shape == velocity.shape[1:]:
         beam = beam.expand(len(keep), -1)
     if beam.shape != (len(keep), velocity.shape[1]):

@@ -1,16 +1,22 @@
 """Smoothing over time: blurred coefficients of single frames, and fits over time in overlapping windows."""
 
+import math
 from collections.abc import Sequence
 
 import torch
 
+from regularize.arguments import NOT_NEGATIVE, checked
 from regularize.errors import InvalidInput
+from regularize.rows.given import dense
 from regularize.rows.walls import WallRows
 
 from .field import SplineField
 from .smoother import Smoother
 
+MOST_WINDOWS = 100_000
 
+
+@checked(width=NOT_NEGATIVE)
 def blur_in_time(fields: Sequence[SplineField], times: Sequence[float], width: float) -> list[SplineField]:
     """Gaussian blur, of standard deviation ``width`` in s, of the coefficients of frames at ``times`` in s.
 
@@ -45,6 +51,7 @@ def blur_in_time(fields: Sequence[SplineField], times: Sequence[float], width: f
 class WindowedField:
     """Fits over overlapping windows of time, blended linearly where two overlap."""
 
+    @checked
     def __init__(self, fields: Sequence[SplineField], windows: Sequence[tuple[float, float]]) -> None:
         self.fields, self.windows = list(fields), list(windows)
 
@@ -88,9 +95,17 @@ def fit_windows(
 
     Memory is that of one window. Arguments as in :meth:`Smoother.fit` with points (n, D + 1).
     """
-    points, velocity = torch.as_tensor(points), torch.as_tensor(velocity)
-    if not 0 < overlap < length:
+    points, velocity = dense("points", points), dense("velocity", velocity)
+    if points.ndim != 2 or not len(points) or not bool(torch.isfinite(points).all()):
+        raise InvalidInput(f"points have shape {tuple(points.shape)}: expected finite (n, D + 1), the time last")
+    if not 0 < overlap < length < math.inf:
         raise InvalidInput(f"overlap is {overlap} and length {length}: overlap must lie between 0 and length")
+    duration = float(points[:, -1].max() - points[:, -1].min())
+    if duration > MOST_WINDOWS * (length - overlap):
+        raise InvalidInput(
+            f"a window every {length - overlap:g} s over {duration:g} s makes more than {MOST_WINDOWS} of them: are "
+            "length, overlap and the points' last column in s?"
+        )
     first, last = float(points[:, -1].min()), float(points[:, -1].max())
     lower, upper = points[:, :-1].amin(0), points[:, :-1].amax(0)
     for more in (None if wall is None else wall.points, divergence_points):

@@ -5,9 +5,10 @@ from dataclasses import dataclass, replace
 
 import torch
 
+from regularize.arguments import checked
 from regularize.basis.knots import Knots
 from regularize.errors import InvalidInput
-from regularize.options import BY_DATA, LOW_NOISE, SAMPLES_OF_LOW_NOISE, SAMPLES_PER_KNOT, SplineOptions
+from regularize.options import BY_DATA, LOW_NOISE, RANGES, SAMPLES_OF_LOW_NOISE, SAMPLES_PER_KNOT, SplineOptions
 from regularize.rows.operators import System
 from regularize.rows.walls import WallRows
 from regularize.solvers.direct import solve_direct
@@ -26,6 +27,7 @@ from .samples import FitData
 from .search import choose
 
 
+@checked(**RANGES)
 @dataclass(frozen=True)
 class Smoother(SplineOptions):
     """The spline fit with its options; see :class:`regularize.options.SplineOptions`."""

@@ -7,6 +7,7 @@ is faster (it skips the zeros of the outer blocks); there this class serves as t
 
 import torch
 
+from regularize.arguments import checked
 from regularize.errors import InvalidInput
 from regularize.rows.ordering import Ordering
 
@@ -37,6 +38,7 @@ class BlockFactor:
                 )
             self._lower.append(factor)
 
+    @checked
     def solve(self, right: torch.Tensor) -> torch.Tensor:
         """(active, C) or (active, C, k) in solve order -> the same shape."""
         flat = right.to(self._lower[0]).reshape(right.shape[0] * right.shape[1], -1)
@@ -57,6 +59,7 @@ class BlockFactor:
         """How many blocks its diagonal has."""
         return len(self._lower)
 
+    @checked
     def block(self, row: int, column: int) -> torch.Tensor:
         """Block of the factor on the diagonal, or just below it."""
         return self._lower[row] if row == column else self._below[column]

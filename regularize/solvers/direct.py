@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import torch
 
+from regularize.arguments import POSITIVE, between, checked
 from regularize.errors import InvalidInput, NotConverged
 from regularize.rows.operators import System
 
@@ -34,6 +35,7 @@ class Direct:
         return solve_direct(system, tolerance=limits.tolerance, single=self.single, strict=limits.strict)
 
 
+@checked(tolerance=POSITIVE, refinements=between(0, 1000))
 def solve_direct(
     system: System | PreparedSystem,
     *,

@@ -4,6 +4,7 @@ import numpy as np
 import torch
 from scipy.linalg.blas import dtbmv
 
+from regularize.arguments import checked
 from regularize.errors import InvalidInput
 from regularize.native import library as native
 from regularize.native.checks import check_band
@@ -16,7 +17,7 @@ from .banded import dense_block
 class Factor:
     """Cholesky factor of a normal matrix; serves any right-hand sides of the same rows and weights.
 
-    ``band`` (unknowns, width) is the lower band as in :func:`regularize.assembly.empty_band`, float64 or
+    ``band`` (unknowns, width) is the lower band as in :func:`regularize.rows.assembly.empty_band`, float64 or
     float32; it is overwritten.
     """
 
@@ -37,6 +38,7 @@ class Factor:
                 "curvature or damping above 0"
             )
 
+    @checked
     def solve(self, right: torch.Tensor) -> torch.Tensor:
         """(active, C) or (active, C, k) in solve order -> the same shape."""
         if right.device != self.band.device or right.ndim == 0 or right.numel() % len(self.band):
@@ -71,6 +73,7 @@ class Factor:
         """How many blocks its diagonal has."""
         return -(-len(self.band) // self.size)
 
+    @checked
     def block(self, row: int, column: int) -> torch.Tensor:
         """Block of the factor on the diagonal, or just below it."""
         return dense_block(self.band, row * self.size, column * self.size)

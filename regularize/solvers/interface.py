@@ -9,6 +9,8 @@ from regularize.basis.knots import Knots
 from regularize.rows.operators import System
 from regularize.rows.ordering import Ordering
 
+MOST_ITERATIONS = 1_000_000
+
 
 @dataclass(frozen=True)
 class Solution:

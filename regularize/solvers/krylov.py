@@ -12,11 +12,12 @@ from typing import Protocol
 
 import torch
 
+from regularize.arguments import POSITIVE, between, checked, finite
 from regularize.errors import InvalidInput, NotConverged
 from regularize.rows.operators import System
 from regularize.rows.sparse import sparse_operators
 
-from .interface import Limits, Neighbour, Solution, Solved
+from .interface import MOST_ITERATIONS, Limits, Neighbour, Solution, Solved
 
 Apply = Callable[[torch.Tensor], torch.Tensor]
 
@@ -68,6 +69,13 @@ class Krylov:
         return Solved(solution)
 
 
+@checked(
+    b=finite(None),
+    weight=finite(),
+    damping=between(0, 1e100),
+    tolerance=POSITIVE,
+    max_iterations=between(1, MOST_ITERATIONS),
+)
 def lsqr(
     matvec: Apply,
     rmatvec: Apply,
@@ -107,6 +115,8 @@ def iterate(
     if tolerance <= 0:
         raise InvalidInput(f"tolerance is {tolerance}: it must be positive")
     w = torch.ones_like(b) if weight is None else weight.to(b.dtype)
+    if w.shape != b.shape:
+        raise InvalidInput(f"weight has the shape {tuple(w.shape)}: it must be that of b, {tuple(b.shape)}")
     w64, b64 = w.double(), b.double()
     right = rmatvec(w64 * (w64 * b64))
     scale = float(right.norm())
@@ -115,7 +125,10 @@ def iterate(
         return Solution(x.to(b.dtype), 0.0, 0, "zero right-hand side", name)
     done, true, reason = 0, 1.0, "iteration limit"
     while done < max_iterations:
-        residual, before = w64 * (b64 - matvec(x)), true
+        seen = matvec(x)
+        if seen.shape != b.shape:
+            raise InvalidInput(f"matvec gives {tuple(seen.shape)} for the {tuple(b.shape)} of b: they must agree")
+        residual, before = w64 * (b64 - seen), true
         process = GolubKahan(lambda v: w * matvec(v), lambda u: rmatvec(w * u), residual, x, damping, b.dtype)
         used = 0
         if process.alpha:

@@ -5,10 +5,19 @@ D. Fong and M. Saunders, SIAM J. Sci. Comput. 33 (2011) 2950. Stopping and weigh
 
 import torch
 
-from .interface import Limits, Solution
+from regularize.arguments import POSITIVE, between, checked, finite
+
+from .interface import MOST_ITERATIONS, Limits, Solution
 from .krylov import Apply, GolubKahan, iterate
 
 
+@checked(
+    b=finite(None),
+    weight=finite(),
+    damping=between(0, 1e100),
+    tolerance=POSITIVE,
+    max_iterations=between(1, MOST_ITERATIONS),
+)
 def lsmr(
     matvec: Apply,
     rmatvec: Apply,

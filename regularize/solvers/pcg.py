@@ -7,11 +7,12 @@ nearly the inverse of the next one's matrix: a handful of iterations replaces as
 
 import torch
 
+from regularize.arguments import POSITIVE, between, checked
 from regularize.errors import InvalidInput, NotConverged
 from regularize.rows.operators import System
 
 from .direct import solve_direct
-from .interface import CholeskyFactor, Limits, Neighbour, Solution, Solved
+from .interface import MOST_ITERATIONS, CholeskyFactor, Limits, Neighbour, Solution, Solved
 from .prepared import PreparedSystem
 
 ITERATIONS = 25  # about what a factorisation costs
@@ -74,6 +75,7 @@ class NeighbourPreconditioner:
         return out
 
 
+@checked(tolerance=POSITIVE, max_iterations=between(1, MOST_ITERATIONS))
 def pcg(
     prepared: PreparedSystem,
     factor: CholeskyFactor,

@@ -4,6 +4,7 @@ from copy import copy
 
 import torch
 
+from regularize.arguments import checked
 from regularize.errors import InvalidInput
 from regularize.native import gram_triton
 from regularize.native import library as native
@@ -26,6 +27,7 @@ class PreparedSystem:
     or "reference" (torch, anywhere); None picks the fast one of the device where it is installed.
     """
 
+    @checked
     def __init__(self, system: System, ordering: Ordering | None = None, engine: str | None = None) -> None:
         self.system = system
         self.ordering = order(system) if ordering is None else ordering

@@ -9,6 +9,7 @@ as wide as the band.
 
 import torch
 
+from regularize.arguments import checked
 from regularize.basis.knots import Knots
 from regularize.solvers.interface import CholeskyFactor
 
@@ -27,6 +28,7 @@ class Posterior:
         self._factor = factor
         self._blocks: list[tuple[torch.Tensor, torch.Tensor | None]] | None = None
 
+    @checked
     def variance(self, points: torch.Tensor) -> torch.Tensor:
         """(n, C) in (m/s)^2 at points (n, A), which must lie in cells that hold rows."""
         knots: Knots = self.ordering.knots

@@ -198,5 +198,5 @@ def test_moving_distance_refuses_bad_options() -> None:
     motion = _drifting_box(np.zeros(3), np.array([0.0, 1.0]))
     with pytest.raises(ValueError, match="a 3-D wall on a 2-D grid"):
         MovingDistance(Grid((0.0, 0.0), (1.0, 1.0), (3, 3)), motion)
-    with pytest.raises(ValueError, match="keep >= 2"):
+    with pytest.raises(ValueError, match="MovingDistance: keep must be from 2"):
         MovingDistance(Grid((0.0,) * 3, (1.0,) * 3, (3, 3, 3)), motion, keep=1)

@@ -143,7 +143,7 @@ def test_times_outside_the_key_frames_are_refused() -> None:
     for t in (-0.1, 1.1):
         with pytest.raises(ValueError, match="known from 0 to 1 s"):
             motion.vertices(t)
-    with pytest.raises(ValueError, match="time must be finite"):
+    with pytest.raises(ValueError, match="WallMotion.volume: t must be finite, got nan"):
         motion.volume(np.nan)
 
 

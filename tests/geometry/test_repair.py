@@ -138,7 +138,7 @@ def test_a_refined_motion_has_the_same_volume_and_rate() -> None:
 
 def test_refining_refuses_nonsense() -> None:
     for spacing in (0.0, -1.0):
-        with pytest.raises(SurfaceError, match="spacing must be positive"):
+        with pytest.raises(SurfaceError, match="spacing must be a positive length"):
             refined(SHAPE, spacing)
     with pytest.raises(SurfaceError, match="is it in m"):
         refined(polygon(np.array([[0, 0], [1, 0], [0, 1]]), 5.0), 1e-12)

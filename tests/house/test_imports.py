@@ -101,6 +101,7 @@ def test_the_top_level_holds_only_what_the_design_names():
         "CONTRIBUTING.md",
         "CHANGELOG.md",
         "LICENSE",
+        "CITATION.cff",
     }
     made_by_tools = {"build", "dist", "torchsph.egg-info", "torchsph-out", "venv", "shared"}
     found = {path.name for path in ROOT.iterdir() if not path.name.startswith(".")} - made_by_tools

@@ -11,6 +11,7 @@ from paths import ROOT
 PAGES = [
     *sorted(ROOT.glob("*.md")),
     *sorted(page for package in ("geometry", "regularize", "torchsph") for page in (ROOT / package).glob("*.md")),
+    *sorted((ROOT / "examples").rglob("*.md")),
 ]
 NAMED = re.compile(r"`([\w./-]+\.(?:py|cpp|hpp|h|md|json|toml|png)|[\w.-]+(?:/[\w.-]+)+/?)`")
 MADE = {  # by commands and by the build

@@ -82,3 +82,16 @@ def test_the_example_runs(tmp_path, monkeypatch):
     written = names["geometry"].read_recording(tmp_path / "analysis.h5")
     assert written.frames == 2
     assert written.velocity == pytest.approx(names["analysis"].recording.velocity)
+
+
+def test_the_citation_is_of_this_version():
+    from torchsph import __version__
+
+    cited = dict(
+        line.split(": ", 1)
+        for line in (ROOT / "CITATION.cff").read_text(encoding="utf-8").splitlines()
+        if re.match(r"[a-z-]+: ", line)
+    )
+    assert cited["cff-version"] == "1.2.0" and cited["version"] == __version__
+    license_of = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["license"]
+    assert cited["license"] == license_of

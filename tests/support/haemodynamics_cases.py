@@ -57,3 +57,22 @@ def hill_vorticity(points: np.ndarray, speed: float = 1.0, radius: float = 1.0) 
     x, y, _ = points.T
     strength = 7.5 * speed / radius**2
     return strength * np.stack([-y, x, np.zeros_like(x)], 1)
+
+
+def walls_of_box(size: float, step: float, rise: float) -> geometry.WallPoints:
+    """Points of a box: the lid is region 1 where x < size / 2 and region 2 beyond; the bottom rises."""
+    line = step * (np.arange(round(size / step)) + 0.5)
+    one, other = (part.ravel() for part in np.meshgrid(line, line))
+    points, normals, velocities, region = [], [], [], []
+    for axis in range(3):
+        for end in (0.0, size):
+            side = np.insert(np.stack([one, other], 1), axis, end, axis=1)
+            points.append(side)
+            normals.append(np.tile((1.0 if end else -1.0) * np.eye(3)[axis], (len(side), 1)))
+            bottom = axis == 2 and not end
+            velocities.append(np.tile([0.0, 0.0, rise * bottom], (len(side), 1)))
+            lid = np.where(side[:, 0] < size / 2, 1, 2) if axis == 2 and end else np.zeros(len(side), int)
+            region.append(lid)
+    areas = np.full(6 * len(one), step**2)
+    parts = (np.concatenate(each) for each in (points, normals, velocities))
+    return geometry.WallPoints(*parts, areas, np.concatenate(region))

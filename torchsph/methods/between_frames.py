@@ -28,6 +28,7 @@ from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 import geometry
+from geometry.arguments import checked, finite
 from geometry.grids.fields import masked_blur
 from torchsph.evaluation.frames import SAME_TIME
 from torchsph.evaluation.metrics import filled_velocity
@@ -92,6 +93,7 @@ class BetweenFrames:
         ValueError: fewer than two frames, or a frame without blood.
     """
 
+    @checked
     def __init__(self, recording: geometry.Recording, model: Simulator | None = None, *, seed: int = 0) -> None:
         if recording.frames < 2:
             raise ValueError(f"BetweenFrames: between takes at least 2 frames, not {recording.frames}")
@@ -104,6 +106,7 @@ class BetweenFrames:
         self.motion = None if recording.wall is None else geometry.WallMotion.from_recording(recording)
         self.failures: dict[int, str] = {}
 
+    @checked(times=finite(), points=finite())
     def at(self, times: ArrayLike, points: ArrayLike) -> FlowAt:
         """Velocity and deviation at all points at all times.
 
@@ -135,6 +138,7 @@ class BetweenFrames:
                 sigma[number] = np.where(known, _sampled(grid, moment.sigma, moment.mask, stencil), 0.0)
         return FlowAt(velocity, sigma, inside)
 
+    @checked
     def moments(self, times: Sequence[float] | np.ndarray, grid: geometry.Grid) -> Iterator[Snapshot]:
         """The flow on a grid, one moment after the other.
 

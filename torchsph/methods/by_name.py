@@ -11,9 +11,11 @@ from typing import Any
 
 import geometry
 import regularize
+from geometry.arguments import between, checked
 from torchsph.simulator.scene import Scene
 from torchsph.simulator.schemes.presets import preset as scheme_preset
 from torchsph.simulator.simulator import Simulator
+from torchsph.simulator.state.checks import MOST_MEMBERS, SPACING
 
 from .ensemble.assimilate import EnsembleRun, assimilate, default_filter, further
 from .ensemble.identity import ensemble_key
@@ -21,6 +23,7 @@ from .ensemble.options import EnsembleOptions
 from .forecast_skill import ForecastSkill, skill
 from .free_run import run_freely
 from .measurement.prepared import PreparedMeasurement
+from .members.amplitude import Amplitude
 from .members.draws import spline_frames
 from .members.frames import FrameObserver
 from .members.kept import MemberFile
@@ -60,6 +63,7 @@ class MethodResult:
     quantities: MemberCurves | None = None
 
 
+@checked(spacing=SPACING)
 def make_model(
     recording: geometry.Recording,
     *,
@@ -87,6 +91,7 @@ def make_smoother(preset: str) -> regularize.Smoother:
     return regularize.Smoother.preset("thesis" if preset == "thesis" else "default")
 
 
+@checked(spacing=SPACING, members=between(1, MOST_MEMBERS))
 def run_methods(
     measured: geometry.Recording,
     methods: Sequence[str],
@@ -303,7 +308,8 @@ def _read_once(resume: bool | Saved, checkpoints: str | Path | None) -> bool | S
 
 def _drawn(prepared: PreparedMeasurement, count: int, seed: int) -> MemberCurves:
     """What draws from the splines' posterior give."""
-    frames = spline_frames(prepared.splines, prepared.smoothed, count, seed=seed)
+    amplitude = Amplitude(prepared.balance, prepared.amplitude_error, count, seed)
+    frames = spline_frames(prepared.splines, prepared.smoothed, count, seed=seed, amplitude=amplitude)
     return quantified(prepared.smoothed, frames)
 
 
@@ -331,6 +337,7 @@ class _Timer:
         return MethodResult(recording, seconds, {} if info is None else info, quantities)
 
 
+@checked(every=between(1, 2**31), spacing=SPACING)
 def forecast_skill(
     recording: geometry.Recording,
     leads: Sequence[float],

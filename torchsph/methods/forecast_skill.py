@@ -13,6 +13,7 @@ import torch
 from tqdm import tqdm
 
 import geometry
+from geometry.arguments import between, checked
 from torchsph.evaluation.frames import frame_at
 from torchsph.simulator.failures import NumericalFailure
 from torchsph.simulator.grid_forecast import GridForecast, Transfer
@@ -63,6 +64,7 @@ class _Sums:
         return {"model": math.sqrt(self.model / scale), "persistence": math.sqrt(self.persistence / scale)}
 
 
+@checked(every=between(1, 2**31))
 def skill(
     recording: geometry.Recording,
     model: Simulator,
@@ -86,6 +88,8 @@ def skill(
         NumericalFailure: every start failed.
     """
     check_grid(recording.grid, model.scene.dimension)
+    if not len(leads):
+        raise ValueError("leads must hold at least one time (s) to forecast over")
     if every < 1 or not all(lead >= 0 for lead in leads):
         raise ValueError(f"leads must not be negative (s), and every at least 1, got {list(leads)} and {every}")
     if transfer is None:

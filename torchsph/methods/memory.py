@@ -26,6 +26,8 @@ from .measurement.frame_splines import FrameSmoother
 
 _BANDS = 4  # copies of a spline's band that live at once while its smoothness is chosen
 _PER_SAMPLE = 10_000  # bytes of rows and of errors that neighbours share
+# beyond this these rows are in blocks so large (32 MB, glibc's M_MMAP_THRESHOLD) that freeing gives them back
+_ROWS_KEPT = 64 << 20
 _PER_PARTICLE = {2: 1_000, 3: 3_000}  # bytes of state, neighbours and sums
 _TABLES_KEPT, _TABLE_MEMORY = 24, 1 << 29  # as `simulator.walls.fields` keeps them
 _SETS_OF_OPENINGS = 2  # tables for each key time: valves open and close in between
@@ -48,6 +50,7 @@ class MemoryPrediction:
         tables: of the walls.
         members: grid fields of the ensemble.
         recordings: the measurement's arrays and those of the results.
+        released: part of the splines' that is free again for particles and tables.
     """
 
     splines: int
@@ -55,11 +58,13 @@ class MemoryPrediction:
     tables: int
     members: int
     recordings: int
+    released: int = 0
 
     @property
     def total(self) -> int:
         """Bytes."""
-        return _LIBRARIES + sum(vars(self).values())
+        simulated = max(0, self.particles + self.tables - self.released)
+        return _LIBRARIES + self.splines + simulated + self.members + self.recordings
 
     def refuse_beyond(self, free: int | None) -> None:
         """Refuse a run that does not fit.
@@ -72,7 +77,7 @@ class MemoryPrediction:
         """
         if free is None or self.total <= free:
             return
-        parts = {name: size for name, size in vars(self).items() if size > 0}
+        parts = {name: size for name, size in vars(self).items() if size > 0 and name in _CURES}
         largest = max(parts, key=lambda name: parts[name])
         told = ", ".join(f"{name} {_size(size)}" for name, size in sorted(parts.items(), key=lambda one: -one[1]))
         raise NotEnoughMemory(
@@ -115,28 +120,30 @@ def predicted(
     runs = list(spacings)
     particles = sum(int(count * volume / spacing**dimension) for spacing, count in runs) * _PER_PARTICLE[dimension]
     arrays = sum(value.nbytes for one in (recording, *further) for value in one.arrays().values())
+    bands, rows = (0, 0) if splines is None else _splines(splines)
     return MemoryPrediction(
-        splines=0 if splines is None else _splines(splines),
+        splines=bands + rows,
         particles=particles,
         tables=sum(_tables(recording, scheme, spacing) for spacing in dict(runs)),
         members=_COPIES_OF_MEMBERS * members * field,
         recordings=arrays + copies * recording.frames * field,
+        released=max(0, rows - _ROWS_KEPT),
     )
 
 
-def _splines(splines: FrameSmoother) -> int:
-    """Of the frame with the most nodes in its mask, by the knots and the band that its fit will have."""
+def _splines(splines: FrameSmoother) -> tuple[int, int]:
+    """Bytes of bands and of rows: of the frame with the most nodes in its mask, by the knots that its fit will have."""
     recording = splines.recording
     frame = int(np.argmax(recording.mask.reshape(recording.frames, -1).sum(1)))
     inside = torch.from_numpy(np.array(recording.mask[frame], bool).reshape(-1))
     points = splines.nodes[inside].double()
     if not len(points):
-        return 0
+        return 0, 0
     silent = torch.zeros_like(points)
     data = FitData.checked(points, silent, divergence_points=points)
     knots = knots_for(data, splines.smoother)
     band = band_bytes(System(knots, recording.dimension, [VectorRows(knots, points, silent, silent)], 0.0))
-    return _BANDS * band + _PER_SAMPLE * len(points)
+    return _BANDS * band, _PER_SAMPLE * len(points)
 
 
 def _tables(recording: geometry.Recording, scheme: Scheme, spacing: float) -> int:

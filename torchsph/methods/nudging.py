@@ -10,6 +10,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 import geometry
+from geometry.arguments import checked
 from torchsph.simulator.simulator import Simulation, Simulator
 from torchsph.simulator.transfer.checks import check_grid
 
@@ -29,6 +30,7 @@ class FilteredRun:
     info: dict[str, object]
 
 
+@checked
 def filter_sph(
     measured: geometry.Recording | PreparedMeasurement,
     model: Simulator,

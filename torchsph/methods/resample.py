@@ -9,7 +9,9 @@ from numpy.typing import ArrayLike
 from tqdm import tqdm
 
 import geometry
+from geometry.arguments import checked, finite
 from torchsph.simulator.simulator import Simulator
+from torchsph.simulator.state.checks import SPACING
 
 from .between_frames import BetweenFrames
 
@@ -29,6 +31,7 @@ def frame_times(time: np.ndarray, rate: float) -> np.ndarray:
     return np.minimum(time[0] + np.arange(count) / rate, time[-1])
 
 
+@checked(times=finite(), spacing=SPACING)
 def resample(
     recording: geometry.Recording,
     model: Simulator | None = None,

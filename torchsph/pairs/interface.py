@@ -189,10 +189,12 @@ class Backend(ABC, Generic[Pairs]):
 
     Attributes:
         overflows: searches that were made again because a list outgrew its room (nothing is ever dropped).
+        differentiable: whether torch can differentiate the sums.
     """
 
     name: str
     overflows = 0
+    differentiable = False
 
     @abstractmethod
     def search(

@@ -41,6 +41,12 @@ def inner(first: Tensor, second: Tensor) -> Tensor:
     return total
 
 
+def norm(vectors: Tensor) -> Tensor:
+    """|v| (N,) of vectors (N, D); that of nought has no slope, where a root would have an infinite one."""
+    square = square_length(vectors)
+    return square.clamp_min(torch.finfo(square.dtype).tiny).sqrt()
+
+
 def square_length(vectors: Tensor) -> Tensor:
     """|v|^2 (N,) of vectors (N, D)."""
     return inner(vectors, vectors)

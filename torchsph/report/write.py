@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 import geometry
+from geometry.arguments import between, checked
 from geometry.recordings.whole_file import write_whole
 from torchsph.evaluation.figures import NOT_CLINICAL, scores_table
 from torchsph.evaluation.frames import matching_frames
@@ -32,6 +33,7 @@ TRACERS = 400
 BYTES = 4 / 3 * 2  # of a number of 16 bits as text
 
 
+@checked(tracers=between(0, 100_000))
 def write_report(
     path: str | Path,
     analysis: geometry.Recording,

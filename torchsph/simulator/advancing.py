@@ -19,6 +19,7 @@ from .state.neighbour_list import PairSearch, rows_carried
 from .state.particles import Particles, frozen, rows_frozen
 from .state.record import Record
 from .stepping.coefficients import Coefficients, Parameters
+from .stepping.replayed_step import Step
 from .stepping.step_length import StepControl
 from .stepping.stepper import make_stepper
 from .surroundings import PresentSurroundings
@@ -120,7 +121,7 @@ class AdvancingRun:
         self.particles, self._acceleration = self._spatial.begin(self.particles, self._acceleration)
         longest = self._longest_step(until)
         for stop in self.domain.breaks(self.time, until):
-            self.surroundings.enter(self.time, stop, valve_strength=self.parameters.valve_strength)
+            self.surroundings.enter(self.time, stop)
             self._renumbered(self.surroundings.prepare(self.particles))
             self._advance_interval(stop, longest)
             self.time = stop
@@ -209,10 +210,10 @@ class AdvancingRun:
         Returns how far each has come in the interval, (members,).
         """
         before, old = self.particles, self._acceleration
-        inner = step.to(before.position.dtype)
-        stepped, acceleration, wall = self._stepper.step(before, inner, self.record.steps, self.surroundings)
-        self.surroundings.at(self.time + (done + step) * self.units.time)
-        after = self.surroundings.constrain(before, stepped, wall, inner, self.record)
+        inner, ends = step.to(before.position.dtype), self.time + (done + step) * self.units.time
+        number = self.record.steps.clone()
+        plan = Step(self._stepper, self.surroundings, self.record, inner, ends, number)
+        after, acceleration, stepped, wall = plan.take(before)
         if any_waiting:
             waiting = step == 0
             after, acceleration = frozen(waiting, before, after), rows_frozen(waiting, before, old, acceleration)

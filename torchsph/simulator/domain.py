@@ -119,6 +119,7 @@ class Domain:
         if self.scene.walls is not None:
             self.scene.walls.locate(time)
 
+    @torch.no_grad()  # an account, not a part of the flow
     def filling(self, particles: Particles, time: float) -> Tensor:
         """Volume of the particles inside over that of the walls, or of the periodic box, (members,) float64.
 

@@ -25,7 +25,7 @@ def broken_members(particles: Particles, scheme: Scheme, record: Record) -> Tens
     p = particles
     broken = torch.zeros_like(record.failed)
     # a sum is finite only if all its terms are; which they are is looked up only where it is not
-    if not math.isfinite(float(p.position.sum() + p.velocity.sum() + p.deviation.sum())):
+    if not math.isfinite(float((p.position.sum() + p.velocity.sum() + p.deviation.sum()).detach())):
         finite = torch.isfinite(p.position).all(1) & torch.isfinite(p.velocity).all(1) & torch.isfinite(p.deviation)
         broken = p.per_member((~finite).to(torch.int64), "sum") > 0
     if scheme.compressible:

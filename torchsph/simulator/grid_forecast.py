@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 import geometry
+from geometry.arguments import checked
 from torchsph.pairs.moving_least_squares import Fetched
 
 from .schemes.option_fields import check_numbers
@@ -58,6 +59,7 @@ class GridForecast:
             start is from a flow that the walls and the incompressible fluid allow. NaN where nothing is projected.
     """
 
+    @checked
     def __init__(
         self,
         model: Simulator,
@@ -92,6 +94,7 @@ class GridForecast:
             known = mask & kept.covered
             self._lost = torch.where(known[:, None], batched.to(kept.value) - kept.value, torch.zeros_like(kept.value))
 
+    @checked
     def at(self, time: float, mask: Tensor) -> tuple[Tensor, Tensor]:
         """Advance to ``time`` (s) and fetch at the nodes of ``mask``.
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from geometry import WallMotion
+from geometry.arguments import between, checked
 
 from .simulator import Simulator
 
@@ -17,6 +18,7 @@ class ResidualMotion:
     largest: float
 
 
+@checked(duration=between(1e-9, 1.0))
 def residual_motion(simulator: Simulator, time: float, *, duration: float = 0.02, seed: int = 0) -> ResidualMotion:
     """What a start at ``time`` (s) leaves moving after ``duration`` (s), with walls held still and no forces or valves.
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 import geometry
+from geometry.arguments import checked
 from geometry.recordings.opening_flux import MOST_REGIONS
 
 from .schemes.option_fields import check_numbers
@@ -22,6 +23,7 @@ _LEAST_SIGMA = 1e-12
 _MOST_BEATS = 100_000
 
 
+@checked
 @dataclass(frozen=True)
 class Fluid:
     """A Newtonian fluid: density (kg/m^3) and dynamic viscosity (Pa s; 0 is inviscid)."""
@@ -42,6 +44,7 @@ class Fluid:
         return self.viscosity / self.density
 
 
+@checked
 @dataclass(frozen=True)
 class Valve:
     """An orifice of the wall that opens and closes.
@@ -110,6 +113,7 @@ class Valve:
         if not rising or not all(math.isfinite(x) for row in table for x in row):
             raise ValueError(f"Valve.flux of region {self.region}: times must increase and fluxes be finite (s, m^3/s)")
 
+    @checked
     def flux_at(self, time: float) -> float:
         """The given flux inwards (m^3/s; m^2/s in a plane) at ``time`` (s).
 
@@ -133,6 +137,7 @@ class Valve:
             raise ValueError(f"Valve.flux of region {self.region} must be finite (m^3/s), got {value} at {time:g} s")
         return value
 
+    @checked
     def pressure_at(self, time: float) -> float:
         """The given pressure (Pa) at ``time`` (s).
 
@@ -146,6 +151,7 @@ class Valve:
             raise ValueError(f"Valve.pressure of region {self.region} must be finite (Pa), got {value} at {time:g} s")
         return value
 
+    @checked
     def is_open(self, time: float) -> bool:
         """Whether the valve is open at ``time`` (s); closed at the closing instant itself."""
         times = [time]
@@ -159,10 +165,12 @@ class Valve:
             times = [time] + [t for t in (time - self.period, time + self.period) if not first <= t <= last]
         return any(opening <= t < closing for opening, closing in self.intervals for t in times)
 
+    @checked
     def passes(self, time: float) -> bool:
         """Whether anything may go through at ``time`` (s): the valve is open, or leaks."""
         return bool(self.leak) or self.is_open(time)
 
+    @checked
     def open_part(self, time: float) -> float:
         """Part of the opening's area that is open at ``time`` (s)."""
         return 1.0 if self.is_open(time) else self.leak or 0.0
@@ -192,6 +200,7 @@ class Valve:
         return first, first + self.period
 
 
+@checked
 @dataclass(frozen=True)
 class Scene:
     """A scene of one flow, in SI units.
@@ -278,6 +287,7 @@ class Scene:
         return value
 
     @classmethod
+    @checked
     def from_recording(
         cls,
         recording: geometry.Recording,

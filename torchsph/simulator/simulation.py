@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from geometry import Grid
+from geometry.arguments import checked
 from torchsph.pairs.moving_least_squares import Fetched
 
 from .advancing import AdvancingRun
@@ -73,15 +74,19 @@ class Simulation(AdvancingRun):
         if values.get("xsph") is not None and scheme.xsph is None:
             raise ValueError("parameter 'xsph' needs a scheme with XSPH, which says of what level and form it is")
         if "valve_strength" in values and not self.domain.valves.takes_strength:
-            raise ValueError("parameter 'valve_strength' needs pressure sources or valves that are given a pressure")
+            raise ValueError(
+                "parameter 'valve_strength' needs pressure sources, or valves with a given flux or pressure"
+            )
         if "smoothing_ratio" in values and self.domain.walls is not None and scheme.wall.complete:
             raise ValueError("the tables of a complete-kernel wall are made for the scheme's smoothing_ratio")
         self.parameters = self.parameters.changed(self.particles.velocity, self.members, **values)
+        self.surroundings.valve_strength = self.parameters.valve_strength
         self._coefficients = Coefficients.of(self.parameters, self.units, self.domain.scene.fluid.density)
         self._stepper.use(self._coefficients)
         self._stepper.pair_search.radius = self._stepper.support.radius
         self._stepper.pair_search.forget()
 
+    @checked
     def impose(self, grid: Grid, velocity: Tensor, mask: Tensor, confidence: Tensor | None = None) -> None:
         """Replace the particles' velocities by those of a grid at the present time.
 
@@ -118,6 +123,7 @@ class Simulation(AdvancingRun):
         """Whether ``project`` knows what the scene's walls ask for."""
         return self.domain.walls is None or self.domain.scheme.wall.complete
 
+    @checked
     def project(self, times: int = 1) -> Tensor:
         """Make the fluid's velocities free of divergence, as the walls and the flux of open valves ask for.
 
@@ -141,6 +147,7 @@ class Simulation(AdvancingRun):
         )
         return (taken / left.clamp_min(torch.finfo(left.dtype).tiny)).sqrt()
 
+    @checked
     def pull(self, grid: Grid, target: Tensor, gain: Tensor, weight: Tensor) -> None:
         """Pull the particles' velocities towards a measured grid.
 
@@ -166,6 +173,7 @@ class Simulation(AdvancingRun):
         moved = pulled(points, p.velocity * self.units.speed, grid, target, gain, weight) / self.units.speed
         self.particles = p.changed(velocity=torch.where(p.inside[:, None], moved, p.velocity))
 
+    @checked
     def fetch(self, grid: Grid, mask: Tensor) -> Fetched:
         """Velocities at the nodes where ``mask`` (*shape): value (members, D, *shape), covered (members, *shape).
 

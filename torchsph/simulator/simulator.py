@@ -6,7 +6,9 @@ from dataclasses import dataclass, field
 
 import torch
 
+from geometry.arguments import checked
 from torchsph.pairs import choose_backend
+from torchsph.pairs.backends.differentiable import DifferentiableBackend
 
 from .domain import Domain
 from .scene import Scene
@@ -19,6 +21,7 @@ from .state.particles import Particles
 from .state.units import Units
 
 
+@checked
 @dataclass(frozen=True)
 class Simulator:
     """A scene with the way to step it.
@@ -30,6 +33,9 @@ class Simulator:
         dtype: in what precision (float32 or float64).
         backend: name of the pair backend, or "auto" for the best one present.
         seeding: how particles are placed; None takes what the scheme's walls call for.
+        differentiable: whether torch can take gradients through imposing, advancing and fetching, in velocities,
+            parameters and what a caller changes of the particles. Values and speed of a run without gradients stay as
+            they are; see ``torchsph/README.md`` for the costs of one with gradients.
     """
 
     scene: Scene
@@ -38,6 +44,7 @@ class Simulator:
     dtype: torch.dtype = torch.float32
     backend: str = "auto"
     seeding: Seeding | None = None
+    differentiable: bool = False
     _domain: Domain = field(init=False, repr=False, compare=False)
     # the last seeding: batches of an ensemble start from the same one, and making it takes as long as some steps
     _seeded: dict[tuple[float, int], Particles] = field(init=False, repr=False, compare=False, default_factory=dict)
@@ -58,6 +65,7 @@ class Simulator:
         """Walls, valves and forces as particles see them; shared by all runs, and changed by none."""
         return self._domain
 
+    @checked
     def start(self, time: float, *, members: int = 1, seed: int = 0) -> Simulation:
         """A resting fluid at ``time`` (s): ``members`` copies of one seeding, drawn with ``seed``.
 
@@ -75,6 +83,7 @@ class Simulator:
             self._seeded[label] = single
         return self.resume(self._seeded[label].repeated(members), time)
 
+    @checked
     def resume(self, particles: Particles, time: float) -> Simulation:
         """Run on with particles in internal units that were made elsewhere.
 
@@ -85,6 +94,9 @@ class Simulator:
         time = check_time(time, "time")
         check_arrays(particles, self.scene.dimension, self.dtype, self.device)
         check_values(particles, self.domain.valves.buffers)
-        run = Simulation(self.domain, choose_backend(self.backend, self.device), particles, time)
+        backend = choose_backend(self.backend, self.device)
+        run = Simulation(
+            self.domain, DifferentiableBackend(backend) if self.differentiable else backend, particles, time
+        )
         run.simulator = self
         return run

@@ -31,12 +31,14 @@ class PresentSurroundings:
 
     Attributes:
         clock: the present times.
+        valve_strength: of the run, a number or (members,); what is entered from now on goes by it.
         valve_acceleration: (N, D), the last one by pressure sources, internal, for the account of their work; None
             while all valves are shut.
     """
 
     def __init__(self, domain: Domain) -> None:
         self.domain, self.clock = domain, Clock(domain.device)
+        self.valve_strength: float | Tensor = 1.0
         self.valve_acceleration: Tensor | None = None
         self._bracket: tuple[float, float] = (0.0, 1.0)
         self._keys: tuple[Tensor, Tensor] | None = None
@@ -47,14 +49,13 @@ class PresentSurroundings:
         """Whether there are walls to look up: an interval was entered, and the scene has some."""
         return self._fields is not None
 
-    def enter(self, start: float, stop: float, *, shut: bool = False, valve_strength: float | Tensor = 1.0) -> None:
+    def enter(self, start: float, stop: float, *, shut: bool = False) -> None:
         """Choose key frames and open valves for an interval (s) without breaks inside.
 
         Args:
             start: s, of the interval.
             stop: s, its end.
             shut: whether every valve is kept shut.
-            valve_strength: of the run that goes through it, a number or (members,).
         """
         domain, middle = self.domain, 0.5 * (start + stop)
         open_regions = () if shut else domain.open_regions(middle)
@@ -62,7 +63,7 @@ class PresentSurroundings:
             self._bracket, keys = domain.wall_keys(middle, open_regions)
             if self._keys is None or keys[0] is not self._keys[0] or keys[1] is not self._keys[1]:
                 self._keys, self._fields = keys, domain.walls.between(*keys)
-        self.clock.enter(start, stop, open_regions, valve_strength)
+        self.clock.enter(start, stop, open_regions, self.valve_strength)
 
     def at(self, times: Tensor | float) -> None:
         """Set the present time of the members, s: (members,) float64 or one for all."""

@@ -44,6 +44,7 @@ class WorkAccount:
         account = cls(domain, record)
         return account if account._moving or domain.valves.does_work else None
 
+    @torch.no_grad()  # an account, not a part of the flow
     def note(
         self,
         before: Particles,

@@ -17,6 +17,7 @@ limits on time and memory; an abuse ends as
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import linecache
 import math
@@ -184,7 +185,8 @@ def main() -> None:
     args = parser.parse_args()
     rows: list[dict[str, str]] = []
     began, draw = time.perf_counter(), np.random.default_rng(args.seed)
-    with tempfile.TemporaryDirectory() as folder:
+    out = args.out and args.out.resolve()
+    with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):  # text in the place of a path is one
         for name, (function, sound) in calls(Path(folder)).items():
             if args.only not in name:
                 continue
@@ -205,8 +207,8 @@ def main() -> None:
                     rows.append({"call": name, "argument": argument, "wrong": how, "ended": kind, "said": text[:400]})
                     if kind in HARM:
                         print(name, argument, how, kind, text[:240], sep=" | ", flush=True)
-    if args.out:
-        args.out.write_text(json.dumps(rows, indent=1), encoding="utf-8")
+    if out:
+        out.write_text(json.dumps(rows, indent=1), encoding="utf-8")
     print(f"{len(rows)} abuses in {time.perf_counter() - began:.0f} s")
     print(f"{'':28s}" + "".join(f"{kind:>10s}" for kind in KINDS))
     for name in dict.fromkeys(row["call"] for row in rows):

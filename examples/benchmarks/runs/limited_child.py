@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import resource
 import select
@@ -12,6 +13,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 MEMORY = 4 << 30  # bytes beyond what the process has
+WAITING = 20  # times the limit, by the clock: others may keep the processor busy
 
 
 def in_child(call: Callable[[], tuple[str, str]], limit: float) -> tuple[str, str]:
@@ -21,7 +23,7 @@ def in_child(call: Callable[[], tuple[str, str]], limit: float) -> tuple[str, st
 
     Args:
         call: what is done.
-        limit: s; after them the child is killed.
+        limit: s of processor time; after them, or ``WAITING`` times as long by the clock, the child is killed.
     """
     reader, writer = os.pipe()
     child = os.fork()
@@ -29,13 +31,14 @@ def in_child(call: Callable[[], tuple[str, str]], limit: float) -> tuple[str, st
         os.close(reader)
         used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
         resource.setrlimit(resource.RLIMIT_AS, (used + MEMORY, used + MEMORY))
+        resource.setrlimit(resource.RLIMIT_CPU, (math.ceil(limit), math.ceil(limit) + 1))
         for stream in (1, 2):
             os.dup2(os.open(os.devnull, os.O_WRONLY), stream)
         with os.fdopen(writer, "w", encoding="utf-8", errors="replace") as pipe:
             json.dump(call(), pipe)
         os._exit(0)
     os.close(writer)
-    answer, end = b"", time.monotonic() + limit
+    answer, end = b"", time.monotonic() + WAITING * limit
     while select.select([reader], [], [], max(0.0, end - time.monotonic()))[0]:
         part = os.read(reader, 1 << 16)
         if not part:
@@ -47,7 +50,8 @@ def in_child(call: Callable[[], tuple[str, str]], limit: float) -> tuple[str, st
     status = os.waitpid(child, 0)[1]
     if os.WIFSIGNALED(status):
         number = os.WTERMSIG(status)
-        return ("hang", f"more than {limit:g} s") if number == signal.SIGKILL else ("crash", f"signal {number}")
+        stopped = number in (signal.SIGKILL, signal.SIGXCPU)
+        return ("hang", f"more than {limit:g} s") if stopped else ("crash", f"signal {number}")
     if not answer:
         return "crash", "no answer"
     kind, text = json.loads(answer)

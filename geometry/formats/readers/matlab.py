@@ -1,8 +1,8 @@
-"""MATLAB files: version 5 to 7 by SciPy, version 7.3 (HDF5) by h5py. Arrays have MATLAB's own order of axes."""
+"""MATLAB files: version 5 to 7 listed by SciPy, version 7.3 (HDF5) by h5py. Arrays have MATLAB's own order of axes."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from functools import cached_property
 from pathlib import Path
 
 import h5py
@@ -11,6 +11,8 @@ import numpy as np
 from geometry.formats.source import ArrayLike, FormatError, Source
 
 from .hdf5 import open_hdf5
+from .matlab_elements import element
+from .streamed import Streamed
 
 NUMBERS = ("double", "single", "int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "uint64", "logical")
 
@@ -18,9 +20,13 @@ NUMBERS = ("double", "single", "int8", "uint8", "int16", "uint16", "int32", "uin
 class Reversed:
     """A MATLAB array in HDF5, whose axes are stored in the opposite order."""
 
+    order = "F"
+
     def __init__(self, node: ArrayLike) -> None:
         self.node, self.dtype = node, node.dtype
         self.shape = tuple(reversed(node.shape))
+        chunks = getattr(node, "chunks", None)
+        self.chunks = tuple(reversed(chunks)) if chunks else None
 
     def __getitem__(self, index: tuple) -> np.ndarray:
         if index == (...,):
@@ -29,17 +35,25 @@ class Reversed:
 
 
 class Variable:
-    """A variable of a version 5 file, read when it is asked for; the file's last one alone is kept."""
+    """A variable of a version 5 to 7 file, looked for when it is asked for."""
 
-    def __init__(self, load: Callable[[], np.ndarray], shape: tuple[int, ...], kind: str, kept: dict) -> None:
-        self._load, self.shape, self._kept = load, shape, kept
+    order = "F"
+
+    def __init__(self, path: Path, name: str, shape: tuple[int, ...], kind: str) -> None:
+        self._path, self._name, self.shape = path, name, shape
         self.dtype = np.dtype({"double": "f8", "single": "f4", "logical": "u1"}.get(kind, kind))
 
+    @cached_property
+    def _stream(self) -> Streamed:
+        return element(self._path, self._name, self.shape)
+
     def __getitem__(self, index: tuple) -> np.ndarray:
-        if self not in self._kept:
-            self._kept.clear()
-            self._kept[self] = self._load()
-        return self._kept[self][index]
+        return self._stream[index]
+
+    def close(self) -> None:
+        """Close the file, if it was opened."""
+        if "_stream" in self.__dict__:
+            self._stream.close()
 
 
 def open_matlab(path: Path) -> Source:
@@ -49,19 +63,19 @@ def open_matlab(path: Path) -> Source:
         # Everything below '#refs#' belongs to cells and objects.
         arrays = {name: Reversed(node) for name, node in source.arrays.items() if not name.startswith("#")}
         return Source(str(path), arrays, axes=_matlab_axes(arrays), close=source.close)
-    from scipy.io import loadmat, whosmat
+    from scipy.io import whosmat
 
     try:
         listed = whosmat(str(path))
     except Exception as fault:  # SciPy's reader has errors of many kinds
         raise FormatError(f"{path}: is no readable MATLAB file ({fault})") from fault
+    found = {name: Variable(path, name, shape, kind) for name, shape, kind in listed if kind in NUMBERS}
 
-    def loader(name: str) -> Callable[[], np.ndarray]:
-        return lambda: np.asarray(loadmat(str(path), variable_names=[name])[name])
+    def close() -> None:
+        for one in found.values():
+            one.close()
 
-    kept: dict = {}
-    found = {name: Variable(loader(name), shape, kind, kept) for name, shape, kind in listed if kind in NUMBERS}
-    return Source(str(path), found, axes=_matlab_axes(found), close=kept.clear)
+    return Source(str(path), found, axes=_matlab_axes(found), close=close)
 
 
 def _matlab_axes(arrays: dict) -> dict[str, str]:

@@ -1,4 +1,4 @@
-"""MetaImage (.mha, .mhd), by SimpleITK: places and vectors in LPS, mm."""
+"""MetaImage (.mha, .mhd): what it says of itself by SimpleITK, places and vectors in LPS, mm."""
 
 from __future__ import annotations
 
@@ -10,24 +10,41 @@ import numpy as np
 
 from geometry.formats.source import FormatError, Source, missing_extra
 
+from .streamed import Inflated, Streamed
 
-class Image:
-    """The pixels of a file, indexed [t, z, y, x, c], read when they are first asked for."""
+TYPES = {
+    "MET_CHAR": "i1",
+    "MET_UCHAR": "u1",
+    "MET_SHORT": "i2",
+    "MET_USHORT": "u2",
+    "MET_INT": "i4",
+    "MET_UINT": "u4",
+    "MET_LONG_LONG": "i8",
+    "MET_FLOAT": "f4",
+    "MET_DOUBLE": "f8",
+}
+HEADER = 1 << 16  # bytes that the text before the values may take
+BIG = ("true", "1", "t")
 
-    def __init__(self, reader: Any) -> None:
-        self._reader = reader
-        components = reader.GetNumberOfComponents()
-        self.shape = tuple(reversed(reader.GetSize())) + ((components,) if components > 1 else ())
-        self.dtype = np.dtype(np.float64)
+
+class Whole:
+    """The pixels of a file that SimpleITK alone reads, as one of many parts, when they are first asked for."""
+
+    def __init__(self, reader: Any, shape: tuple[int, ...]) -> None:
+        self._reader, self.shape, self.dtype = reader, shape, np.dtype(np.float64)
 
     @cached_property
-    def _values(self) -> np.ndarray:
-        import SimpleITK
-
-        return SimpleITK.GetArrayFromImage(self._reader.Execute())
+    def _image(self) -> Any:
+        return self._reader.Execute()
 
     def __getitem__(self, index: tuple) -> np.ndarray:
-        return self._values[index]
+        import SimpleITK
+
+        return SimpleITK.GetArrayViewFromImage(self._image)[index]
+
+    def close(self) -> None:
+        """Let go of the pixels."""
+        self.__dict__.pop("_image", None)
 
 
 def open_metaimage(path: Path) -> Source:
@@ -42,13 +59,14 @@ def open_metaimage(path: Path) -> Source:
         reader.ReadImageInformation()
     except RuntimeError as fault:
         raise FormatError(f"{path}: is no readable MetaImage ({str(fault).splitlines()[-1]})") from fault
-    count, image = reader.GetDimension(), Image(reader)
+    count, components = reader.GetDimension(), reader.GetNumberOfComponents()
+    image = _image(path, reader, tuple(reversed(reader.GetSize())) + ((components,) if components > 1 else ()))
     space = min(count, 3)
     affine = np.eye(space + 1)
     direction = np.array(reader.GetDirection()).reshape(count, count)[:space, :space]
     affine[:-1, :-1] = direction * np.array(reader.GetSpacing()[:space])
     affine[:-1, -1] = reader.GetOrigin()[:space]
-    vector = len(image.shape) > count
+    vector = components > 1
     name = path.name.partition(".")[0]
     time = None
     if count == 4:
@@ -62,4 +80,48 @@ def open_metaimage(path: Path) -> Source:
         world="lps",
         time=time,
         roles={"velocity": (name,)} if vector else {},
+        close=image.close,
     )
+
+
+def _image(path: Path, reader: Any, shape: tuple[int, ...]) -> Streamed | Whole:
+    """The pixels, indexed [t, z, y, x, c], where they are one stream of bytes; else by SimpleITK."""
+    said, start = _header(path)
+    place, kind = said.get("elementdatafile", ""), TYPES.get(said.get("elementtype", ""))
+    skipped = said.get("headersize", "0") != "0" or said.get("binarydata", "True").lower() == "false"
+    if kind is None or skipped or place.upper() == "LIST" or "%" in place or not place:
+        return Whole(reader, shape)
+    local = place.upper() == "LOCAL"
+    file = path if local else path.parent / place
+    if not file.is_file():
+        raise FormatError(f"{path}: its values lie in {file}, which is no file; put it there")
+    big = said.get("binarydatabyteordermsb", said.get("elementbyteordermsb", "False")).lower() in BIG
+    packed = said.get("compresseddata", "False").lower() in BIG
+    begin = start if local else 0
+    return Streamed(
+        path,
+        lambda: Inflated(file.open("rb"), begin) if packed else file.open("rb"),  # type: ignore[arg-type, return-value]
+        0 if packed else begin,
+        shape,
+        np.dtype(kind).newbyteorder(">" if big else "<"),
+        order="C",
+        stored=file.stat().st_size - begin,
+        packed=packed,
+    )
+
+
+def _header(path: Path) -> tuple[dict[str, str], int]:
+    """What the text at the head of a file says, keys in lower case, and where it ends: after `ElementDataFile`."""
+    with path.open("rb") as file:
+        head = file.read(HEADER)
+    said, at = {}, 0
+    while True:
+        end = head.find(b"\n", at)
+        line = head[at : end if end >= 0 else len(head)].decode("latin-1")
+        key, equals, value = line.partition("=")
+        if not equals:
+            return said, at
+        said[key.strip().lower()] = value.strip()
+        at = end + 1 if end >= 0 else len(head)
+        if key.strip().lower() == "elementdatafile" or end < 0:
+            return said, at

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import gzip
+from collections.abc import Callable
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import IO, Any, cast
 
 import numpy as np
 
 from geometry.formats.source import FormatError, Source, missing_extra
 from geometry.recordings.units import factor
+
+from .streamed import Streamed
 
 SPACES = {
     "left-posterior-superior": "lps",
@@ -19,15 +23,30 @@ SPACES = {
 }
 VECTORS = ("vector", "3-vector", "2-vector", "covariant-vector", "3-color", "rgb-color")
 SERIES = ("list", "time")
+TYPES = {
+    name: kind
+    for kind, names in {
+        "i1": ("signed char", "int8", "int8_t"),
+        "u1": ("uchar", "unsigned char", "uint8", "uint8_t"),
+        "i2": ("short", "short int", "signed short", "signed short int", "int16", "int16_t"),
+        "u2": ("ushort", "unsigned short", "unsigned short int", "uint16", "uint16_t"),
+        "i4": ("int", "signed int", "int32", "int32_t"),
+        "u4": ("uint", "unsigned int", "uint32", "uint32_t"),
+        "i8": ("longlong", "long long", "long long int", "signed long long", "int64", "int64_t"),
+        "f4": ("float",),
+        "f8": ("double",),
+    }.items()
+    for name in names
+}
 
 
-class Image:
-    """The values of a file, read when they are first asked for; x runs fastest and stands first."""
+class Whole:
+    """The values of a file in an encoding that pynrrd alone reads, all at once, when they are first asked for."""
 
-    def __init__(self, path: Path, header: dict[str, Any]) -> None:
-        self._path = path
-        self.shape = tuple(int(size) for size in header["sizes"])
-        self.dtype = np.dtype(np.float64)
+    order = "F"
+
+    def __init__(self, path: Path, shape: tuple[int, ...]) -> None:
+        self._path, self.shape, self.dtype = path, shape, np.dtype(np.float64)
 
     @cached_property
     def _values(self) -> np.ndarray:
@@ -38,6 +57,54 @@ class Image:
     def __getitem__(self, index: tuple) -> np.ndarray:
         return self._values[index]
 
+    def close(self) -> None:
+        """Let go of the values."""
+        self.__dict__.pop("_values", None)
+
+
+def _image(path: Path, header: dict[str, Any], start: int) -> Streamed | Whole:
+    """The values of a file whose own would begin at `start`; x runs fastest and stands first.
+
+    Raises:
+        FormatError: the file with the values is missing or too small for them.
+    """
+    shape = tuple(int(size) for size in header["sizes"])
+    encoding, detached = str(header.get("encoding", "")).lower(), header.get("data file", header.get("datafile"))
+    kind = TYPES.get(str(header.get("type", "")).lower())
+    skipped = int(header.get("line skip", header.get("lineskip", 0))) or int(header.get("byte skip", 0))
+    if kind is None or encoding not in OPENED or skipped:
+        return Whole(path, shape)
+    place = path if detached is None else path.parent / str(detached)
+    if not place.is_file():
+        raise FormatError(f"{path}: its values lie in {place}, which is no file; put it there")
+    dtype = np.dtype(kind).newbyteorder(">" if str(header.get("endian", "little")).lower() == "big" else "<")
+    begin = start if detached is None else 0
+    return Streamed(
+        path,
+        lambda: OPENED[encoding](place, begin),
+        begin if encoding == "raw" else 0,
+        shape,
+        dtype,
+        order="F",
+        stored=place.stat().st_size - begin,
+        packed=encoding != "raw",
+    )
+
+
+def _gunzipped(path: Path, start: int) -> IO[bytes]:
+    file = path.open("rb")
+    file.seek(start)
+    stream = gzip.GzipFile(fileobj=file, mode="rb")
+    stream.myfileobj = file  # is closed with it
+    return cast(IO[bytes], stream)
+
+
+OPENED: dict[str, Callable[[Path, int], IO[bytes]]] = {
+    "raw": lambda path, _: path.open("rb"),
+    "gzip": _gunzipped,
+    "gz": _gunzipped,
+}
+
 
 def open_nrrd(path: Path) -> Source:
     """One array, named after the file, with the directions, units and times of its header."""
@@ -46,10 +113,12 @@ def open_nrrd(path: Path) -> Source:
     except ImportError as fault:
         raise missing_extra(path, "pynrrd") from fault
     try:
-        header = nrrd.read_header(str(path))
+        with path.open("rb") as file:
+            header = nrrd.read_header(file)
+            start = file.tell()
     except (nrrd.NRRDError, OSError, ValueError) as fault:
         raise FormatError(f"{path}: is no readable NRRD file ({fault})") from fault
-    image = Image(path, header)
+    image = _image(path, header, start)
     axes = _axes(header, len(image.shape), path)
     name = path.name.partition(".")[0]
     world = SPACES.get(str(header.get("space", "")).lower(), "")
@@ -64,6 +133,7 @@ def open_nrrd(path: Path) -> Source:
         world=world,
         time=_times(header, axes, image.shape),
         roles={"velocity": (name,)} if "c" in axes and image.shape[axes.index("c")] == 3 else {},
+        close=image.close,
     )
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from geometry.formats.field_map import FieldMap
 from geometry.formats.source import FormatError, Source, diagonal
 
-from .piv_text import _rows as rows_of
+from .tables import tables
 
 MYPTV = "id,x,y,z,u,v,w,ax,ay,az,t"  # of its `smoothed_trajectories`
 
@@ -27,7 +27,7 @@ def open_tracks(path: Path, said: FieldMap) -> Source:
         standard deviation of the mean, `sigma`.
     """
     names = (said.columns or MYPTV).replace(" ", "").split(",")
-    rows = rows_of(path)
+    rows = np.concatenate(list(tables(path)))
     space = [axis for axis in "xyz" if axis in names]
     needed = [*space, *"uvw"[: len(space)], "t"]
     if len(space) < 2 or any(name not in names for name in needed):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from haemodynamics_cases import ball, hill_vortex, on_grid, order
+from haemodynamics_cases import ball, hill_vortex, on_grid, order, walls_of_box
 
 import geometry
 from torchsph.haemodynamics.fields.sampling import plane_section
@@ -58,25 +58,6 @@ def test_two_openings_share_what_the_walls_sweep():
     exact = [-whole * (0.5 + tilt / np.pi), -whole * (0.5 - tilt / np.pi)]
     assert sum(flows) == pytest.approx(-whole, rel=0.01)
     assert flows == pytest.approx(exact, rel=0.03)
-
-
-def walls_of_box(size, step, rise):
-    """Points of a box: the lid is region 1 where x < size / 2 and region 2 beyond; the bottom rises."""
-    line = step * (np.arange(round(size / step)) + 0.5)
-    one, other = (part.ravel() for part in np.meshgrid(line, line))
-    points, normals, velocities, region = [], [], [], []
-    for axis in range(3):
-        for end in (0.0, size):
-            side = np.insert(np.stack([one, other], 1), axis, end, axis=1)
-            points.append(side)
-            normals.append(np.tile((1.0 if end else -1.0) * np.eye(3)[axis], (len(side), 1)))
-            bottom = axis == 2 and not end
-            velocities.append(np.tile([0.0, 0.0, rise * bottom], (len(side), 1)))
-            lid = np.where(side[:, 0] < size / 2, 1, 2) if axis == 2 and end else np.zeros(len(side), int)
-            region.append(lid)
-    areas = np.full(6 * len(one), step**2)
-    parts = (np.concatenate(each) for each in (points, normals, velocities))
-    return geometry.WallPoints(*parts, areas, np.concatenate(region))
 
 
 def test_an_opening_that_moves_with_the_blood_lets_nothing_through(box_recording):

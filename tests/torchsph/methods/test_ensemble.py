@@ -156,6 +156,24 @@ def test_the_kernel_shows_in_the_colour_of_the_noise(width):
     assert kernel_width(draw.standard_normal(noise.shape), used, spacing) == 0.0
 
 
+def test_the_kernel_is_found_behind_splines_that_follow_the_noise(measured, smoothed):
+    """Noise of a known kernel on a smooth field: what splines leave of it looks narrower; they are seen through."""
+    spacing, width = tuple(measured.grid.spacing), 2.8 * min(measured.grid.spacing)
+    draw = torch.Generator().manual_seed(0)
+    noise = smooth_noise(
+        3 * measured.frames, measured.grid.shape, fwhm_to_deviation(width), spacing, draw, dtype=torch.float64
+    )
+    noise = 0.06 * noise.reshape(measured.velocity.shape).numpy()
+    made = measured.with_velocity((smoothed.velocity + noise * measured.mask[:, None]).astype(np.float32))
+    splines = FrameSmoother(made, Smoother())
+    fields = smooth_frames(splines)
+    used = np.stack([node_weights(made, frame) > 0 for frame in range(made.frames)])
+    left = kernel_width((made.velocity - fields.velocity).astype(np.float64), used, spacing)
+    found = estimate_error(made, splines, fields).kernel
+    assert left < 0.95 * width
+    assert found == pytest.approx(width, rel=0.08)
+
+
 @pytest.mark.parametrize("trust", [-1.0, 0.0, 1.0])
 def test_the_weight_counts_for_what_it_is_worth(measured, smoothed, splines, trust):
     draw = np.random.default_rng(1)

@@ -80,5 +80,5 @@ def test_pressure_sources_have_a_strength_and_valves_of_given_flux_have_none():
     push, count = run.surroundings.valve_acceleration, run.particles.count // 2
     assert push.norm(dim=1).max() > 0
     torch.testing.assert_close(4.0 * push[:count], push[count:], rtol=1e-2, atol=1e-3 * float(push.abs().max()))
-    with pytest.raises(ValueError, match="'valve_strength' needs pressure sources or valves"):
+    with pytest.raises(ValueError, match="'valve_strength' needs pressure sources, or valves"):
         Simulator(scene, preset("default")).start(time).change(valve_strength=2.0)

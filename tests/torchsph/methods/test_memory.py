@@ -99,3 +99,10 @@ def test_a_control_group_counts_with_all_groups_above_it(tmp_path: Path):
     assert _control_group(tmp_path, own) == 2 * GB + 7
     assert _control_group(tmp_path, tmp_path / "gone") is None
     assert 10**7 < free_memory() < 10**14
+
+
+def test_what_splines_give_back_is_used_again():
+    def total(**more: int) -> int:
+        return MemoryPrediction(splines=300, particles=50, tables=100, members=1, recordings=2, **more).total
+
+    assert total() - total(released=80) == 80 and total() - total(released=10**9) == 150  # no more than is needed later

@@ -44,8 +44,9 @@ def test_one_observation_moves_the_analysis_there_and_says_so(
 ) -> None:
     """Everything but one node is silent in the last frame; without it the forecast is the analysis.
 
-    What frees an analysis of its divergence reaches everywhere, so that it is left out here.
+    What gives an analysis its balance of mass and frees it of divergence reaches everywhere: it is left out here.
     """
+    monkeypatch.setattr(PreparedMeasurement, "balance", None)
     monkeypatch.setattr(
         "torchsph.methods.ensemble.analyses.without_divergence", lambda field, *_: Cleaned(field, 0.0, True)
     )

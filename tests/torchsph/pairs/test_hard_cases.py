@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import subprocess
+import sys
 
 import pytest
 import torch
@@ -173,6 +175,27 @@ def test_period_too_short(either):
     state = disordered(6, 3)
     with pytest.raises(ValueError, match="shorter than three search radii"):
         either.search(state.position, state.member, 2.4, period=torch.tensor([6.0, 100.0, 100.0]))
+
+
+SMALL_SETS = """
+import torch
+from torchsph.pairs import choose_backend
+
+backend, draw = choose_backend("cpu"), torch.Generator().manual_seed(0)
+for count in range(9, 200):
+    for _ in range(8):
+        place = torch.tensor([4.7, 4.6, 7.0]) * torch.rand((count, 3), generator=draw, dtype=torch.{kind})
+        backend.search(place, torch.zeros(count, dtype=torch.int64), 2.85)
+print("through")
+"""
+
+
+@pytest.mark.parametrize("kind", ["float32", "float64"])
+@pytest.mark.skipif(not PRESENT["cpu"].present, reason=PRESENT["cpu"].reason)
+def test_small_sets_stay_inside_their_buffers(kind):
+    """Registers of doubles wrote up to 12 bytes behind a list's buffer, which ended the process: so in a child."""
+    done = subprocess.run([sys.executable, "-c", SMALL_SETS.format(kind=kind)], capture_output=True, text=True)
+    assert done.returncode == 0 and done.stdout.strip() == "through", done.stderr[-500:]
 
 
 def test_radius_not_positive(either):

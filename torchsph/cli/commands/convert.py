@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import geometry
-from geometry.formats import FORMATS, FieldMap, WallOptions, read_field_map
+from geometry.formats import FORMATS, FieldMap, MotionOptions, WallOptions, read_field_map
 from geometry.formats import convert as convert_files
 
 from ..command import Command
@@ -59,6 +59,13 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
     walls.add_argument("--wall-unit", default="", metavar="UNIT", help="of its lengths (that of the fields)")
     walls.add_argument("--openings", type=int, default=0, metavar="N", help="its N longest holes are orifices")
     walls.add_argument("--unite", action="store_true", help="bodies that overlap become one")
+    walls.add_argument(
+        "--sheet", default="", choices=["inner", "all"], help="of a wall of finite thickness: the blood's surface, or all"
+    )
+    walls.add_argument("--motion", nargs="+", default=[], metavar="FILE", help="displacements that move the one surface")
+    walls.add_argument("--motion-map", metavar="MAP.toml", help="their field map; `velocity` names the displacements")
+    walls.add_argument("--motion-arrays", metavar="NAME[,NAME]", help="the displacements among the arrays of the files")
+    walls.add_argument("--motion-unit", default="", metavar="UNIT", help="of the displacements (that of their lengths)")
     walls.add_argument("--smoothing", type=int, default=0, metavar="N", help="passes over a wall from a mask")
     parser.add_argument("--rho", type=float, default=1060.0, metavar="D", help="kg/m3 (%(default)s)")
     parser.add_argument("--mu", type=float, default=0.004, metavar="V", help="Pa s (%(default)s)")
@@ -70,17 +77,33 @@ def convert(args: argparse.Namespace) -> None:
     """Run `torchsph convert`."""
     said = read_field_map(args.map) if args.map else FieldMap()
     said = replace(said, **_given(args))
-    wall = WallOptions(tuple(args.wall), args.wall_unit, args.openings, args.unite, args.smoothing)
+    wall = WallOptions(
+        tuple(args.wall),
+        args.wall_unit,
+        openings=args.openings,
+        unite=args.unite,
+        smoothing=args.smoothing,
+        motion=_motion(args),
+        sheet=args.sheet,
+    )
     result = convert_files(
         args.inputs, said, format=args.format, wall=wall, rho=args.rho, mu=args.mu, description=args.description
     )
-    inputs = {"inputs": [name for name in args.inputs if Path(name).is_file()], "wall": args.wall, "map": args.map}
+    inputs = {"inputs": [name for name in args.inputs if Path(name).is_file()], "wall": args.wall, "map": args.map, "motion": args.motion}
     account = provenance(args, inputs)
     geometry.write_recording(args.out, result.recording, strict=args.strict, provenance=account)
     for note in result.notes:
         say(f"note: {note}")
     tell_findings(result.recording, args.out)
     say(f"wrote {result.recording.frames} frames to {args.out}")
+
+
+def _motion(args: argparse.Namespace) -> MotionOptions:
+    """What moves the wall."""
+    said = read_field_map(args.motion_map) if args.motion_map else FieldMap()
+    if args.motion_arrays:
+        said = replace(said, velocity=tuple(part.strip() for part in args.motion_arrays.split(",")))
+    return MotionOptions(tuple(args.motion), said, args.motion_unit)
 
 
 def _given(args: argparse.Namespace) -> dict[str, Any]:

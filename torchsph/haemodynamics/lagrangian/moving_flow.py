@@ -81,10 +81,20 @@ class MovingFlow:
         """The last moment, s: the last frame, or the end of the period."""
         return self.start + self.period if self.period else float(self.time[-1])
 
-    @property
-    def fastest(self) -> float:
-        """Highest speed at a node, m/s."""
-        return float(self.frames.square().sum(1).max().sqrt())
+    def pieces(self, before: float, after: float) -> list[tuple[float, float, float]]:
+        """The way between two times, s, cut at the frames: begin, end and the highest speed, m/s, of every piece."""
+        low, high = min(before, after), max(before, after)
+        frames = self.time
+        if self.period:
+            first, last = (int((t - self.start) // self.period) for t in (low, high))
+            frames = np.concatenate([self.time + k * self.period for k in range(first, last + 1)])
+        cuts = np.concatenate([[low], frames[(frames > low) & (frames < high)], [high]])
+        speeds = self.frames.square().sum(1).flatten(1).amax(1).sqrt().tolist()
+        found = []
+        for begin, end in zip(cuts[:-1].tolist(), cuts[1:].tolist(), strict=True):
+            key = self._locate(0.5 * (begin + end))[0]
+            found.append((begin, end, max(speeds[key], speeds[(key + 1) % len(speeds)])))
+        return found if after >= before else [(end, begin, speed) for begin, end, speed in reversed(found)]
 
     def field(self, t: float) -> Tensor:
         """Velocity `(D, *shape)`, m/s, at time `t`, s.

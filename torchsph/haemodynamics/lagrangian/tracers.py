@@ -63,7 +63,7 @@ def carry(
         start: s.
         end: s.
         walls: what turns tracers back and lets them out; `None`: nothing does.
-        courant: spacings that the fastest blood may move in a step.
+        courant: spacings that the fastest blood of a frame interval may move in a step.
         keep: times between `start` and `end`, s, at which positions are kept beside those two.
 
     Raises:
@@ -75,11 +75,10 @@ def carry(
     place = torch.as_tensor(points, dtype=flow.frames.dtype, device=flow.frames.device).clone()
     left_through = torch.zeros(len(place), dtype=torch.long, device=place.device)
     left_at = place.new_full((len(place),), float("nan"))
-    limit = courant * min(flow.grid.spacing) / max(flow.fastest, STEADY)
+    reach = courant * min(flow.grid.spacing)
     paths, inside = [place.clone()], torch.arange(len(place), device=place.device)
     for before, after in zip(marks[:-1], marks[1:], strict=True):
-        steps = max(1, int(np.ceil(abs(after - before) / limit - 1e-9)))
-        times = np.linspace(before, after, steps + 1)
+        times = _steps(flow, float(before), float(after), reach)
         for t, following in zip(times[:-1], times[1:], strict=True):
             if len(inside) == 0:
                 break
@@ -94,6 +93,15 @@ def carry(
                 place[inside] = moved
         paths.append(place.clone())
     return Tracers(marks, torch.stack(paths), left_through, left_at)
+
+
+def _steps(flow: MovingFlow, before: float, after: float, reach: float) -> list[float]:
+    """Times from `before` to `after`, s, between which nothing moves by more than `reach`, m."""
+    times = [before]
+    for begin, end, speed in flow.pieces(before, after):
+        count = max(1, int(np.ceil(abs(end - begin) * max(speed, STEADY) / reach - 1e-9)))
+        times += np.linspace(begin, end, count + 1)[1:].tolist()
+    return times
 
 
 def _marks(start: float, end: float, keep: np.ndarray) -> np.ndarray:

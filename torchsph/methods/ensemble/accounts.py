@@ -35,10 +35,16 @@ def accounts_of(cycle: Cycle) -> dict[str, Any]:
         "spread_factor": cycle.analyser.spread_match.factor,
         "observation_error_scale": cycle.analyser.scale.factor.tolist(),
         "kernel": [measurement.kernel for measurement in cycle.measurements],
+        "amplitude_error": _amplitude_error(cycle),
         "estimated": learned,
         "filter": kept,
         "options": repr(cycle.options),
     }
+
+
+def _amplitude_error(cycle: Cycle) -> float | None:
+    """The deviation of the members' amplitudes, relative; None where nobody looks at members."""
+    return None if cycle.member_frames is None else cycle.measurements[0].prepared.amplitude_error
 
 
 def _divergent(cycle: Cycle) -> int:

@@ -12,6 +12,7 @@ from torch import Tensor
 import geometry
 from torchsph.assimilation import Analysis
 
+from ..measurement.wall_balance import WallBalance
 from .divergence_cleaning import without_divergence
 from .forecaster import Ensemble
 from .lagged import Lagged, LaggedAnalyses
@@ -23,9 +24,10 @@ class Analyses:
     Args:
         measured: the recording whose frames they belong to.
         lag: cycles whose data still move an analysis, or None.
+        balance: of mass between the walls, which the fields keep; None: they keep their own.
 
     Attributes:
-        fields: (D, *shape) for each frame, m/s, freed of divergence.
+        fields: (D, *shape) for each frame, m/s, of the walls' balance of mass and without divergence.
         sigmas: (D, *shape) for each frame, m/s, what the filter claims.
         missing: nodes for each frame that the forecast did not cover.
         quality: (*shape) uint8 for each frame, codes of ``geometry.Quality``.
@@ -40,8 +42,8 @@ class Analyses:
     events: list[dict[str, Any]]
     shocks: list[float]
 
-    def __init__(self, measured: geometry.Recording, lag: int | None) -> None:
-        self.measured = measured
+    def __init__(self, measured: geometry.Recording, lag: int | None, balance: WallBalance | None = None) -> None:
+        self.measured, self.balance = measured, balance
         self.lagged = None if lag is None else LaggedAnalyses(lag)
         self.fields, self.sigmas, self.missing, self.quality, self.events, self.shocks = [], [], [], [], [], []
 
@@ -122,7 +124,8 @@ class Analyses:
 
     def _clean(self, control: Tensor, frame: int) -> Tensor:
         mask = np.array(self.measured.mask[frame], bool)
-        found = without_divergence(control.numpy(), mask, self.measured.grid.spacing)
+        field = control.numpy() if self.balance is None else self.balance.nearest(control.numpy(), frame)
+        found = without_divergence(field, mask, self.measured.grid.spacing)
         if not found.converged:
             self.happened(frame, divergence_left=found.left)
         return torch.from_numpy(found.velocity).to(torch.float32)

@@ -21,8 +21,10 @@ from numpy.typing import ArrayLike
 from tqdm import tqdm
 
 import geometry
+from geometry.arguments import between, checked
 from torchsph.assimilation import LETKF, RTPS, Filter, Localisation
 from torchsph.simulator.simulator import Simulator
+from torchsph.simulator.state.checks import MOST_MEMBERS
 from torchsph.simulator.transfer.checks import check_grid
 
 from ..between_frames import BetweenFrames, FlowAt
@@ -59,6 +61,7 @@ class EnsembleRun:
         return BetweenFrames(self.recording, self.model).at(times, points)
 
 
+@checked
 def default_filter(measured: geometry.Recording, options: EnsembleOptions) -> LETKF:
     """Local ensemble transform Kalman filter with RTPS, its radius from the size of the walls."""
     vertices = measured.wall_for("the ensemble").at(0).vertices
@@ -66,6 +69,7 @@ def default_filter(measured: geometry.Recording, options: EnsembleOptions) -> LE
     return LETKF(localisation=Localisation(radius), inflation=RTPS(options.relaxation), gross_error=options.gross_error)
 
 
+@checked(members=between(1, MOST_MEMBERS))
 def assimilate(
     measured: geometry.Recording | PreparedMeasurement,
     model: Simulator,

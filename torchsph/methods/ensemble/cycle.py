@@ -17,6 +17,7 @@ from torchsph.simulator.failures import NumericalFailure
 
 from ..measurement.observation_batch import Part, gathered
 from ..measurement.observation_operator import Measurement
+from ..members.amplitude import Amplitude
 from ..members.frames import FrameObserver, MemberFrames
 from ..runtime.parallel import forked, from_last, is_last, shared
 from .analyser import Analyser
@@ -66,12 +67,16 @@ class Cycle:
         self.measured, self.grid = measurements[0].recording, measurements[0].grid
         self.splines = measurements[0].prepared.splines
         self.generator = torch.Generator().manual_seed(seed)
-        self.analyses = Analyses(self.measured, options.lag)
+        prepared = measurements[0].prepared
+        self.analyses = Analyses(self.measured, options.lag, prepared.balance)
         self.analyser = Analyser(
             self.measurements, filter_, options, self.generator, self.analyses, truth=truth, seed=seed
         )
         self.forecast_spread = ForecastSpread(measurements[0], options, members, self.generator, self.analyses)
-        self.member_frames = MemberFrames(self.measured, observers) if observers else None
+        self.member_frames = None
+        if observers:
+            amplitude = Amplitude(prepared.balance, prepared.amplitude_error, members, seed)
+            self.member_frames = MemberFrames(self.measured, observers, amplitude)
         self._ensemble: Ensemble | None = None
         self.alive = members
 

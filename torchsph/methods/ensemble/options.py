@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from geometry.arguments import checked
 from torchsph.assimilation import Parameter
 from torchsph.simulator.grid_forecast import Transfer
 from torchsph.simulator.schemes.option_fields import check_numbers
@@ -14,6 +15,7 @@ from torchsph.simulator.schemes.option_fields import check_numbers
 INCREMENTS = ("spline", "ensemble")
 
 
+@checked
 @dataclass(frozen=True)
 class Estimated:
     """A parameter of the simulator that the members disagree about and the filter learns.
@@ -41,6 +43,7 @@ class Estimated:
         return self.parameter.decode(middle + self.spread * (noise - noise.mean()))
 
 
+@checked
 @dataclass(frozen=True)
 class EnsembleOptions:
     """Settings of the cycle; lengths and speeds are relative to the scene, so that hearts of any size fit.

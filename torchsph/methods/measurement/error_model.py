@@ -4,8 +4,7 @@ The file's ``sigma`` is believed where there is one.  Otherwise the errors are e
 what a smooth, incompressible field cannot explain is noise.
 
 A tracking kernel averages noise and flow alike, so the length over which the errors are correlated tells how far the
-measurement is blurred (``ObservationError.kernel``): white noise averaged by a Gaussian of deviation s has the
-autocorrelation exp(-r^2 / (4 s^2)).
+measurement is blurred (``ObservationError.kernel``; ``kernel_width.py``).
 """
 
 from __future__ import annotations
@@ -15,24 +14,19 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.ndimage import gaussian_filter
-from scipy.optimize import brentq
 
 import geometry
-from torchsph.assimilation.diagnostics.scores import CHI2_MEDIAN
+from geometry.arguments import checked
 
 from .frame_splines import FrameSmoother, node_weights
+from .kernel_width import FWHM, behind_splines, kernel_width
 
 _MAD_TO_STD = 1.4826
 _SURPRISING = 3.0
-# the lags in nodes whose differences tell the kernel's width: short enough for what is left of the flow to be smooth
-_NEAR, _FAR = 1, 3
-# widths that lags of whole nodes can tell apart, in node spacings; and the noise that is too little to show its own
-_NARROWEST, _WIDEST = 1.2, 5.0
-_LITTLE = 0.05
+_LITTLE = 0.05  # of the speed: noise that is too little to show its own kernel
 _ABOVE = 1.5  # times the stated deviation: more is no noise
 _MOST_TRUST = 2.0
 _AROUND = 2.0  # nodes, deviation of the Gaussian that averages the residuals' level
-_FWHM = 2.0 * math.sqrt(2.0 * math.log(2.0))
 
 
 @dataclass(frozen=True)
@@ -75,6 +69,7 @@ class ObservationError:
         return self.deviation[frame].reshape(shape) ** 2 * factor
 
 
+@checked
 def estimate_error(
     measured: geometry.Recording, splines: FrameSmoother, smoothed: geometry.Recording
 ) -> ObservationError:
@@ -114,6 +109,8 @@ def estimate_error(
     # is much of what one component's spline leaves, which the file's own deviation makes needless
     noisy = _LITTLE * speed < left < _ABOVE * stated and (kind.full or not told)
     kernel = kernel_width(residual, used, measured.grid.spacing) if noisy else 0.0
+    if kernel > 0 and kind.full:
+        kernel = behind_splines(kernel, splines, robust)
     redundancy = np.full(measured.frames, _nodes_of(kernel, measured.grid.spacing))
     for frame in range(measured.frames):
         choice = splines.choice(frame) if kind.full else None
@@ -132,53 +129,9 @@ def _local_level(distance: np.ndarray, used: np.ndarray) -> np.ndarray:
     return np.where(used, power / np.maximum(share, 1e-6), 1.0)
 
 
-def kernel_width(residual: np.ndarray, used: np.ndarray, spacing: tuple[float, ...]) -> float:
-    """Full width at half maximum (m) of the kernel that coloured the noise; 0 where neighbours share none of it.
-
-    From the differences of the noise, residual (T, C, *shape), over ``_NEAR`` and ``_FAR`` nodes along each axis,
-    whose squares have the means 2 s^2 (1 - rho(r)): their ratio tells the width, whatever the deviation s is. The
-    median over the nodes stands for the mean, because the deviation of tracking noise varies from place to place, and
-    the median over axes and components is taken.
-    """
-    widths = []
-    for axis, step in enumerate(reversed(spacing), start=1):
-        if residual.shape[axis + 1] <= _FAR:
-            continue
-        for part in np.moveaxis(residual, 1, 0):
-            near, far = (_median_square(part, used, axis, lag) for lag in (_NEAR, _FAR))
-            if far > 0:
-                widths.append(step * _width_of(near / far))
-    width = float(np.median(widths)) if widths else 0.0
-    return width if width > _NARROWEST * min(spacing) else 0.0
-
-
-def _median_square(part: np.ndarray, used: np.ndarray, axis: int, lag: int) -> float:
-    """Mean square of the differences over ``lag`` nodes, from their median as if they were Gaussian."""
-    early, late = np.arange(part.shape[axis] - lag), np.arange(lag, part.shape[axis])
-    both = np.take(used, early, axis) & np.take(used, late, axis)
-    steps = (np.take(part, late, axis) - np.take(part, early, axis))[both]
-    return float(np.median(np.abs(steps)) ** 2 / CHI2_MEDIAN) if len(steps) else 0.0
-
-
-def _width_of(ratio: float) -> float:
-    """Width in nodes at which the squares of the differences have this ratio, within what lags can tell."""
-
-    def excess(width: float) -> float:
-        return _rise(_NEAR, width) / _rise(_FAR, width) - ratio
-
-    if excess(_NARROWEST) <= 0:
-        return 0.0
-    return _WIDEST if excess(_WIDEST) >= 0 else brentq(excess, _NARROWEST, _WIDEST)
-
-
-def _rise(lag: float, width: float) -> float:
-    """1 - rho(lag) of noise from a kernel of full width ``width`` at half maximum, in nodes."""
-    return -math.expm1(-((lag * _FWHM / width) ** 2) / 4.0)
-
-
 def _nodes_of(kernel: float, spacing: tuple[float, ...]) -> float:
     """The volume of the errors' autocorrelation in nodes: the integral of exp(-r^2 / (4 s^2)) over one node's."""
-    reach = math.sqrt(4.0 * math.pi) * kernel / _FWHM
+    reach = math.sqrt(4.0 * math.pi) * kernel / FWHM
     return math.prod(max(reach / step, 1.0) for step in spacing)
 
 

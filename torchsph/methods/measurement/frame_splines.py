@@ -14,6 +14,7 @@ from tqdm import tqdm
 
 import geometry
 import regularize
+from geometry.arguments import checked
 from regularize.solvers.factor import Factor
 
 from ..runtime.parallel import shared
@@ -311,6 +312,7 @@ def _motion(recording: geometry.Recording) -> geometry.WallMotion:
     return replace(motion, rates_at_keys=wall.velocity[:1].astype(np.float64))
 
 
+@checked
 def smooth(
     measured: geometry.Recording, smoother: regularize.Smoother | None = None, *, progress: bool = False
 ) -> geometry.Recording:

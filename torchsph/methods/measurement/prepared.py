@@ -11,6 +11,7 @@ import regularize
 
 from .error_model import ObservationError, estimate_error
 from .frame_splines import FrameSmoother, smooth_frames
+from .wall_balance import WallBalance, amplitude_error
 
 
 class PreparedMeasurement:
@@ -68,6 +69,17 @@ class PreparedMeasurement:
     def error(self) -> ObservationError:
         """How wrong the measurement is, from what its splines leave over."""
         return estimate_error(self.recording, self.splines, self.smoothed)
+
+    @cached_property
+    def balance(self) -> WallBalance | None:
+        """Of mass between the walls; None without walls, or where the velocities contradict them."""
+        motion = self.splines.motion
+        return None if motion is None or self.splines.estimates.contradicted else WallBalance(self.recording, motion)
+
+    @cached_property
+    def amplitude_error(self) -> float:
+        """How wrong amplitudes found in this measurement are, relative: what its splines miss of the known flow."""
+        return 0.0 if self.balance is None else amplitude_error(self.balance, self.smoothed)
 
     @cached_property
     def reference_speed(self) -> float:

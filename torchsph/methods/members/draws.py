@@ -19,6 +19,7 @@ import geometry
 from torchsph.haemodynamics.fields.acceleration import time_derivative
 
 from ..measurement.frame_splines import FrameSmoother
+from .amplitude import Amplitude
 from .frames import MemberFrame
 
 __all__ = ["spline_frames"]
@@ -27,7 +28,12 @@ _ORDER = 2  # of accuracy in time: frames on each side of the one whose du/dt is
 
 
 def spline_frames(
-    splines: FrameSmoother, smoothed: geometry.Recording, members: int, *, seed: int = 0
+    splines: FrameSmoother,
+    smoothed: geometry.Recording,
+    members: int,
+    *,
+    seed: int = 0,
+    amplitude: Amplitude | None = None,
 ) -> Iterator[MemberFrame]:
     """The splines of a recording with members drawn around them; a few frames are held at a time.
 
@@ -36,6 +42,7 @@ def spline_frames(
         smoothed: what they are on the grid.
         members: N, at least 2.
         seed: of the draws; those of a frame do not depend on which frames came before.
+        amplitude: what members are off by as a whole; None: nothing.
 
     Raises:
         ValueError: fewer than two members.
@@ -48,7 +55,10 @@ def spline_frames(
     first = 0  # frame of the first field that is held
     for frame in range(smoothed.frames):
         while first + len(held) < min(frame + _ORDER + 1, smoothed.frames):
-            held.append(_drawn(splines, smoothed, first + len(held), members, seed))
+            fields = _drawn(splines, smoothed, first + len(held), members, seed)
+            if amplitude is not None:
+                fields[1:] += amplitude.of_fields(torch.from_numpy(fields[0]), first + len(held)).numpy()
+            held.append(fields)
         while first < frame - _ORDER:
             held.popleft()
             first += 1

@@ -23,6 +23,7 @@ from torch import Tensor
 import geometry
 
 from ..runtime.parallel import is_lead
+from .amplitude import Amplitude
 
 __all__ = ["FrameObserver", "MemberFrame", "MemberFrames", "at_frame"]
 
@@ -70,10 +71,13 @@ class MemberFrames:
     Args:
         recording: the measurement, whose masks, times and valves are those of the analyses.
         observers: what is done with each frame, in this order.
+        amplitude: what members are off by as a whole; None: nothing.
     """
 
-    def __init__(self, recording: geometry.Recording, observers: Sequence[FrameObserver]) -> None:
-        self.recording, self.observers = recording, list(observers)
+    def __init__(
+        self, recording: geometry.Recording, observers: Sequence[FrameObserver], amplitude: Amplitude | None = None
+    ) -> None:
+        self.recording, self.observers, self.amplitude = recording, list(observers), amplitude
         times = np.unique(recording.valve_intervals_or_derived()[:, 1:])
         self._events = times[np.isfinite(times)]
         self._before: dict[str, Tensor] | None = None
@@ -89,7 +93,10 @@ class MemberFrames:
             members: (N, D, *shape), m/s, of the ensemble that goes on from it; their mean need not be the estimate.
         """
         mask = torch.from_numpy(np.array(self.recording.mask[frame], bool))
-        around = torch.where(mask, field + members - members.mean(0), 0.0).to(torch.float32)
+        around = field + members - members.mean(0)
+        if self.amplitude is not None:
+            around = around + self.amplitude.of_fields(field, frame)
+        around = torch.where(mask, around, 0.0).to(torch.float32)
         self._frame, self._pending = frame, {"field": field, "members": around}
 
     def forecast(self, rate: Tensor, member_rates: Tensor, failed: Tensor, pressure: Tensor) -> None:
@@ -125,13 +132,14 @@ class MemberFrames:
         for observer, kept in zip(self.observers, state["observers"], strict=True) if is_lead() else ():
             observer.restore(kept)
 
-    @staticmethod
-    def _of_all(rate: Tensor, member_rates: Tensor, failed: Tensor) -> dict[str, Tensor]:
-        """Rates of the estimate and of every member; one that has failed takes the mean of the others."""
+    def _of_all(self, rate: Tensor, member_rates: Tensor, failed: Tensor) -> dict[str, Tensor]:
+        """Rates of the estimate, and of the members around it; one that has failed has that of the estimate."""
         mean = member_rates[~failed].mean(0) if bool((~failed).any()) else rate
-        members = torch.where(failed.reshape(-1, *[1] * mean.ndim), mean, member_rates)
-        lost = not bool(torch.isfinite(rate).any())
-        return {"rate": mean if lost else rate, "member_rates": members}
+        own = mean if not bool(torch.isfinite(rate).any()) else rate
+        apart = torch.where(failed.reshape(-1, *[1] * mean.ndim), 0.0, member_rates - mean)
+        if self.amplitude is not None:
+            apart = apart + self.amplitude.of_rates(own)
+        return {"rate": own, "member_rates": own + apart}
 
     def _hand_on(self, after: dict[str, Tensor] | None) -> None:
         frame, pending, before = self._frame, self._pending, self._before

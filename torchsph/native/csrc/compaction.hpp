@@ -1,5 +1,7 @@
 // Appending the numbers of those lanes that pass a test: the one operation that vector extensions cannot express.
 #pragma once
+#include <algorithm>
+
 #include "lanes.hpp"
 
 #if defined(__AVX2__)
@@ -29,7 +31,10 @@ SPH_INLINE int append_set(std::int32_t* to, std::int32_t first, unsigned mask) {
 }
 #endif
 
-// Write first + l for each lane l < here with value < limit; returns how many. May write a whole register at `to`.
+// What `append_below` may write at `to`, whatever it returns: a whole register of int32, of which doubles fill half.
+template <class Real> constexpr int append_width = std::max(Lanes<Real>::count, 8);
+
+// Write first + l for each lane l < here with value < limit; returns how many, after `append_width` were written over.
 template <class Real>
 SPH_INLINE int append_below(std::int32_t* to, std::int32_t first, int here, typename Lanes<Real>::Vector value,
                             typename Lanes<Real>::Vector limit) {

@@ -57,7 +57,7 @@ SPH_INLINE void sift(const Columns<Real>& c, const Reach<Real, D>& a, std::int64
                      std::vector<std::int32_t>& out, std::size_t& size) {
   using L = Lanes<Real>;
   using V = typename L::Vector;
-  const std::size_t room = size + std::size_t(last - first) + L::count;
+  const std::size_t room = size + std::size_t(last - first) + append_width<Real>;
   if (out.size() < room) out.resize(2 * room);
   std::int32_t* to = out.data() + size;
   for (std::int64_t j = first; j < last; j += L::count) {

@@ -139,7 +139,8 @@ class PlannedBackend(Backend[Planned]):
                 )
             if tensor.requires_grad:
                 raise ValueError(
-                    f"the {self.name} backend is not differentiable; use backend='reference' for gradients"
+                    f"the {self.name} backend is not differentiable; make the Simulator with differentiable=True, "
+                    "or use backend='reference' for gradients of the sums alone"
                 )
 
 

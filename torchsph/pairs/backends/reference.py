@@ -33,7 +33,7 @@ class PairList:
 class ReferenceBackend(Backend[PairList]):
     """Eager torch on a list that holds each pair once; both of its sides are added from the same numbers."""
 
-    name = "reference"
+    name, differentiable = "reference", True
 
     def search(
         self,

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from geometry.arguments import checked
+
 from .option_fields import check_numbers
 
 
+@checked
 @dataclass(frozen=True)
 class XSPH:
     """XSPH (Grønli 2017, eq. 2.33): neighbours' velocities pull with strength ``epsilon``.
@@ -31,6 +34,7 @@ class XSPH:
             raise ValueError(f"XSPH form must be 'pairs' or 'centroid', got '{self.form}'")
 
 
+@checked
 @dataclass(frozen=True)
 class GammaRamp:
     """The exponent gamma of the Tait equation grows after a start or an imposition (Grønli 2017, sec. 5.2).
@@ -57,6 +61,7 @@ class GammaRamp:
             raise ValueError(f"GammaRamp.keep must be 'prefactor' or 'sound_speed', got '{self.keep}'")
 
 
+@checked
 @dataclass(frozen=True)
 class Rollback:
     """A member that fails goes back to its last good state and tries again with steps half as long.

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+from geometry.arguments import checked
+
 from .parts import XSPH
 from .projection import Projection
 from .scheme import Scheme
@@ -56,6 +58,7 @@ PRESETS: dict[str, Scheme] = {
 }
 
 
+@checked
 def preset(name: str, **changes: Any) -> Scheme:
     """The preset called ``name``, with some options changed.
 

@@ -8,12 +8,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from geometry.arguments import between
 from torchsph.pairs.backends.checks import expect
 
 from .particles import CHANNEL, RESERVOIR, Particles
 
 # each holds all particles: more fit into no machine
 MOST_MEMBERS = 2**16
+SPACING = between(1e-6, 1.0)  # m, of particles in a recording; less and more are mistakes of units
+MOST_RATIO = 1e6  # of the heaviest particle's mass to the lightest one's
 
 
 def check_time(time: float, name: str) -> float:
@@ -153,6 +156,9 @@ def check_values(particles: Particles, openings: int = 0) -> None:
         )
     if bool((p.mass <= 0).any()):
         raise ValueError(f"the particles' mass must be positive, but is {float(p.mass.min()):g} at the least")
+    least, most = (float(value) for value in torch.aminmax(p.mass))
+    if most > MOST_RATIO * least:
+        raise ValueError(f"the particles' mass runs from {least:g} to {most:g}: particles of one run are alike")
     if bool((p.deviation <= -1).any()):
         raise ValueError(
             "the particles' deviation, (rho - rho0) / rho0, must be above -1 (no density at all), but is "

@@ -41,6 +41,10 @@ class PairSearch:
     searches: int = 0
     renewed: Tensor | None = None
 
+    def apart(self) -> PairSearch:
+        """A search like this one that has found nothing yet."""
+        return PairSearch(self.backend, self.radius, self.margin, self.period)
+
     def stale(self, particles: Particles) -> Tensor:
         """(members,) bool: whose particles have moved, or changed in number, beyond what the list allows for."""
         return self._stale(particles, self._listed(particles))

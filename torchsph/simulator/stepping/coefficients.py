@@ -34,8 +34,8 @@ class Parameters:
         xsph: epsilon of the scheme's XSPH.
         viscosity: dynamic, Pa s.
         valve_strength: factor on what drives the flow through open valves: on the strength Q of pressure sources
-            (Grønli 2017, eq. 3.4), and on differences between the pressures that valves are given. The flux of other
-            valves follows from the walls' motion, which leaves nothing to be set.
+            (Grønli 2017, eq. 3.4), on fluxes that valves are given, and on differences between the pressures that
+            they are given. The flux of other valves follows from the walls' motion, which leaves nothing to be set.
     """
 
     sound_speed: float | Tensor | None
@@ -95,6 +95,8 @@ def _checked(
     if not bool((fine & torch.isfinite(row)).all()):
         wanted = "positive" if name in _NEEDED else "not negative"
         raise ValueError(f"parameter '{name}' must be {wanted} and finite, got {row.tolist()}")
+    if row.requires_grad:
+        return row.expand(members)
     return row if isinstance(value, Sequence) or row.ndim else float(value)
 
 

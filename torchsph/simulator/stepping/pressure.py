@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchsph.pairs.interface import MomentumTerms, Rates, RateTerms, Support
 from torchsph.pairs.poisson import PoissonSolution
-from torchsph.pairs.vectors import inner, square_length
+from torchsph.pairs.vectors import inner, norm
 
 from ..state.neighbour_list import PairSearch
 from ..state.particles import Particles
@@ -104,16 +104,26 @@ class Neighbourhood:
         Returns:
             (N,).
         """
-        p = self.particles
-        group = p.member
+        p, weight = self.particles, counted.to(filling.dtype)
+        classes = 1 if self.complete_wall is None else _CLASSES
+        place = torch.zeros_like(filling)
         if self.complete_wall is not None:
-            group = group * (_CLASSES + 1) + (self.complete_wall.completeness * _CLASSES).to(torch.int64)
-        weight = counted.to(filling.dtype)
-        size = p.members * (_CLASSES + 1)
-        count = filling.new_zeros(size).index_add(0, group, weight)
-        mean = filling.new_zeros(size).index_add(0, group, weight * filling) / count.clamp_min(1.0)
-        excess = (filling / mean[group].clamp_min(_SMALLEST) - 1.0).clamp(-_LARGEST_EXCESS, _LARGEST_EXCESS)
-        return torch.where(counted, excess, torch.zeros_like(excess))
+            place = (self.complete_wall.completeness * _CLASSES - 0.5).clamp(0.0, _CLASSES - 1.0)
+        # between two classes a particle belongs to both by its distance: no particle's source may jump
+        low = place.detach().floor().clamp_max(max(classes - 2, 0)).to(torch.int64)
+        upper = place - low
+        rows = [p.member * classes + (low + step).clamp_max(classes - 1) for step in (0, 1)]
+        parts = [1.0 - upper, upper]
+        count = total = filling.new_zeros(p.members * classes)
+        for row, part in zip(rows, parts, strict=True):
+            count = count.index_add(0, row, weight * part)
+            total = total.index_add(0, row, weight * part * filling)
+        mean = torch.where(count > 0, total / count.clamp_min(_SMALLEST), torch.ones_like(count))
+        level = parts[0] * mean[rows[0]] + parts[1] * mean[rows[1]]
+        excess = (filling / level.clamp_min(_SMALLEST) - 1.0).clamp(-_LARGEST_EXCESS, _LARGEST_EXCESS)
+        excess = torch.where(counted, excess, torch.zeros_like(excess))
+        rest = p.per_member(excess, "sum") / p.per_member(weight, "sum").clamp_min(1.0)
+        return excess - torch.where(counted, rest.index_select(0, p.member), torch.zeros_like(excess))
 
     def _wall_jump(self, wall: CompleteWallSample) -> Tensor:
         """What the divergence at walls lacks, as a source (N,): half of the jump from the fluid's speed to the wall's.
@@ -124,7 +134,7 @@ class Neighbourhood:
         noise at their edges.
         """
         p = self.particles
-        steep = square_length(wall.completeness_gradient).sqrt()
+        steep = norm(wall.completeness_gradient)
         terms = MomentumTerms(pressure="difference")
         along = inner(p.velocity, wall.normal)
         fall = self.search.backend.momentum(self.pairs, p.state(along), self.support, terms)

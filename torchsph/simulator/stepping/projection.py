@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import replace
 
 import torch
@@ -57,6 +58,13 @@ class ProjectionStepper:
             concentration=coefficients.shifting is not None,
             shepard=self.scheme.relaxation is not None or self.scheme.surface is not None,
         )
+
+    def apart(self, coefficients: Coefficients, record: Record) -> ProjectionStepper:
+        """See ``Stepper.apart``."""
+        other = copy(self)
+        other.pair_search, other._record = self.pair_search.apart(), record
+        other.use(coefficients)
+        return other
 
     def at_pressure(self, particles: Particles, row: Tensor, pressure: Tensor) -> Particles:
         """Particles whose ``row`` (n,) carry ``pressure`` (n,), p / rho0, into the next projection."""

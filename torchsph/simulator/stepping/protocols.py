@@ -10,6 +10,7 @@ from torchsph.pairs.interface import Support
 
 from ..state.neighbour_list import PairSearch
 from ..state.particles import Particles
+from ..state.record import Record
 from ..walls.interface import WallSample
 from .coefficients import Coefficients
 
@@ -61,6 +62,9 @@ class Stepper(Protocol):
 
     def use(self, coefficients: Coefficients) -> None:
         """Step with these coefficients from now on."""
+
+    def apart(self, coefficients: Coefficients, record: Record) -> Stepper:
+        """A stepper like this one, with these coefficients, a neighbour list and an account of its own."""
 
     def pressure(self, particles: Particles) -> Tensor:
         """p / rho0 (N,), internal, of particles as they are."""

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from torchsph.pairs.vectors import per_particle, square_length
+from torchsph.pairs.vectors import norm, per_particle
 
 from ..schemes.scheme import Scheme
 from ..state.particles import Particles
@@ -56,13 +56,13 @@ class Shifting:
             (N, D), internal.
         """
         member = particles.member
-        speed = square_length(particles.velocity).sqrt().clamp_min(_SPEED_FLOOR)
+        speed = norm(particles.velocity).clamp_min(_SPEED_FLOOR)
         if self.largest:
             speed = particles.per_member(speed, "amax").index_select(0, member)
         amount = per_particle(self.strength * self.smoothing_length, member) * speed * per_particle(step, member)
         shift = -amount[:, None] * concentration_gradient
         if self.surface is not None:
-            steepness = per_particle(self.smoothing_length, member) * square_length(concentration_gradient).sqrt()
+            steepness = per_particle(self.smoothing_length, member) * norm(concentration_gradient)
             shift = shift * (steepness < self.surface)[:, None]
-        length = square_length(shift).sqrt()
+        length = norm(shift)
         return shift * (_LARGEST_SHIFT / length.clamp_min(_LARGEST_SHIFT))[:, None]

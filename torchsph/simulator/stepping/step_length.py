@@ -25,6 +25,7 @@ class StepControl:
         self._record, self._floor = record, floor
         self._last_limit = torch.zeros(record.members, dtype=torch.float64, device=record.failed.device)
 
+    @torch.no_grad()  # a step's length is piecewise constant in the state: an interval is divided evenly
     def step(
         self,
         particles: Particles,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from copy import copy
+
 from torch import Tensor
 
 from ..schemes.projection import Projection
@@ -19,6 +21,13 @@ from .weakly_compressible import WeaklyCompressibleSums
 
 class WeaklyCompressibleStepper(WeaklyCompressibleSums):
     """Steps particles with the weakly compressible scheme, in the order that its options name."""
+
+    def apart(self, coefficients: Coefficients, record: Record) -> WeaklyCompressibleStepper:
+        """See ``Stepper.apart``."""
+        other = copy(self)
+        other.pair_search = self.pair_search.apart()
+        other.use(coefficients)
+        return other
 
     def step(self, particles: Particles, step: Tensor, number: Tensor, around: Surroundings) -> Stepped:
         """Advance every member by a step of its own (``Stepper.step``)."""

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from torch import Tensor
 
+from geometry.arguments import between, checked
 from geometry.formats import PolySeries
 
 if TYPE_CHECKING:
@@ -56,6 +57,7 @@ class ParticleSeries:
     when the block ends well; what it holds is kept in memory until then. Writing changes nothing of the run.
     """
 
+    @checked(every=between(1, 2**31), member=between(0, 2**31))
     def __init__(self, path: str | Path, run: Run, *, every: int = 1, member: int = 0) -> None:
         """Begin with the present state.
 

@@ -11,6 +11,7 @@ from ..state.record import Record
 from ..state.units import Units
 
 
+@torch.no_grad()  # an account, not a part of the flow
 def note_passed(
     record: Record, passed: Particles, valve: int, pressure: Tensor, units: Units, density: float, *, entered: bool
 ) -> None:

@@ -37,7 +37,7 @@ class CavityVolume:
         device: str,
         dtype: torch.dtype,
     ) -> None:
-        self._wrapped, self._device, self._dtype = wrapped_time, device, dtype
+        self._wrapped, self.device, self.dtype = wrapped_time, device, dtype
         key = np.asarray(motion.time)
         fraction = np.arange(_FLUX_SAMPLES) / _FLUX_SAMPLES
         self._times = np.append((key[:-1, None] + fraction * np.diff(key)[:, None]).ravel(), key[-1])
@@ -49,7 +49,7 @@ class CavityVolume:
 
     def rate(self, times: Tensor) -> Tensor:
         """dV/dt at times (s): what has to enter through the open valves together."""
-        return self._looked_up(self._rates, times, self._dtype)
+        return self._looked_up(self._rates, times, self.dtype)
 
     def rate_at(self, time: float) -> float:
         """dV/dt at one time (s)."""
@@ -59,8 +59,8 @@ class CavityVolume:
         """V at times (s), in ``dtype`` or that of the tables."""
         if self._volumes is None:
             raise ValueError("the volume of this cavity was not tabulated; ask for it with with_volume=True")
-        return self._looked_up(self._volumes, times, dtype or self._dtype)
+        return self._looked_up(self._volumes, times, dtype or self.dtype)
 
     def _looked_up(self, table: np.ndarray, times: Tensor, dtype: torch.dtype) -> Tensor:
         value = np.interp([self._wrapped(time) for time in times.tolist()], self._times, table)
-        return torch.as_tensor(value, dtype=dtype, device=self._device)
+        return torch.as_tensor(value, dtype=dtype, device=self.device)

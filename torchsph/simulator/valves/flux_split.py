@@ -83,7 +83,7 @@ def fluxes(openings: Openings, clock: Clock, total: Tensor, *, time: float | Non
         region = sum(p.area for n, p in active if openings.all[n].label == openings.all[number].label)
         times = clock.of_members(len(total)).tolist() if time is None else [time] * len(total)
         given = [valve.flux_at(t) for t in times]
-        found[number] = total.new_tensor(given) / openings.flux_unit * (plane.area / region)
+        found[number] = total.new_tensor(given) / openings.flux_unit * (plane.area / region) * clock.valve_strength
         rest = rest - found[number]
     free = takers(openings, active)
     if found and not free:

@@ -25,7 +25,8 @@ from ..state.record import Record
 from .accounts import note_passed
 from .buffer_flow import AREA_TRUST, mean_near, scaled_profile, volume_of_rows, with_channel_flux
 from .cavity_volume import CavityVolume
-from .flux_split import fluxes, takers
+from .flux_split import fluxes
+from .free_channel import free_length
 from .model import Pressure, ValveModel, ValveSetting
 from .openings import OpeningPlane, Openings
 from .plane_groups import apart, measured_apart
@@ -64,7 +65,8 @@ class Reservoirs(ValveModel):
             setting.dtype,
         )
         self._shared = SharedFlux(self.openings, self.volume)
-        self.takes_strength = bool(self.openings.given)
+        given = (self.openings.valve(number).flux is not None for number in range(self.buffers))
+        self.takes_strength = bool(self.openings.given) or any(given)
 
     def pressure_reservoirs(self, backend: Backend) -> PressureReservoirs | None:
         """What drives the buffers of valves with a given pressure, or None."""
@@ -89,20 +91,8 @@ class Reservoirs(ValveModel):
         return deficit / (self.volume.volume(times) * self.relaxation)
 
     def _lead(self, number: int, clock: Clock, members: int) -> float | Tensor:
-        """Length of the free channel before the buffer of an opening: 0 where fluid enters in the present interval.
-
-        One for all members, or (members,) where openings share what they pass: members may differ in its sense.
-        """
-        if not self._run_out or number in self.openings.given:
-            return 0.0
-        shared = (
-            self.openings.valve(number).flux is None and len(takers(self.openings, self.openings.active(clock))) > 1
-        )
-        inflow = torch.full((members if shared else 1,), self.volume.rate_at(clock.middle), dtype=self._setting.dtype)
-        through = fluxes(self.openings, clock, inflow.to(self._setting.device), time=clock.middle)[number]
-        if shared:
-            return torch.where(through < 0.0, self._run_out, 0.0).to(through)
-        return self._run_out if float(through) < 0.0 else 0.0
+        """See ``free_channel.free_length``."""
+        return free_length(self.openings, self.volume, self._run_out, number, clock, members)
 
     def split_points(self, clock: Clock) -> Tensor | None:
         """See ``SharedFlux.points``."""
@@ -224,7 +214,7 @@ class Reservoirs(ValveModel):
                 fresh.append(copy.changed(position=copy.position + (self._far - lead[fed])[:, None] * plane.normal))
             if any_odd:
                 # what drifted freely behind an outlet is no profile for the inlet that it has turned into
-                inlet = turned & self._of_members_with(odd, particles)
+                inlet = turned & _of_members_with(odd, particles)
                 velocity = torch.where(inlet[:, None], plane.velocity, particles.velocity)
                 particles = particles.changed(velocity=velocity)
             kind = torch.where(beyond, torch.where(height < lead, channel, buffer), kind)
@@ -240,11 +230,6 @@ class Reservoirs(ValveModel):
         for copy in fresh:
             particles = particles.joined(copy)
         return particles, True
-
-    @staticmethod
-    def _of_members_with(rows: Tensor, particles: Particles) -> Tensor:
-        """(N,) bool: particles of members that have any of the rows (N,) bool."""
-        return (particles.per_member(rows.to(torch.int64), "sum") > 0)[particles.member]
 
     def _account(
         self,
@@ -302,3 +287,8 @@ class Reservoirs(ValveModel):
             behind = (particles.kind == RESERVOIR + number) | (particles.kind == CHANNEL - number)
             points = torch.where(behind[:, None], points + inward, points)
         return points
+
+
+def _of_members_with(rows: Tensor, particles: Particles) -> Tensor:
+    """(N,) bool: particles of members that have any of the rows (N,) bool."""
+    return (particles.per_member(rows.to(torch.int64), "sum") > 0)[particles.member]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from torchsph.pairs.vectors import square_length
+from torchsph.pairs.vectors import norm
 
 from .interface import CompleteWallSample
 
@@ -62,7 +62,7 @@ def completed(
 def friction_rate(viscosity: float | Tensor, wall: CompleteWallSample) -> Tensor:
     """2 nu |grad gamma| / d (N,): by which laminar friction takes on a no-slip wall's velocity (see ``friction``)."""
     gap = wall.distance.clamp_min(SMALLEST_FRICTION_DISTANCE)
-    return 2.0 * viscosity * square_length(wall.completeness_gradient).sqrt() / gap
+    return 2.0 * viscosity * norm(wall.completeness_gradient) / gap
 
 
 def friction(viscosity: float | Tensor, velocity: Tensor, wall: CompleteWallSample) -> Tensor:

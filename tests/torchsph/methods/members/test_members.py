@@ -13,6 +13,7 @@ import geometry
 from torchsph import EnsembleOptions, PreparedMeasurement, Simulator, assimilate, preset
 from torchsph.data import sample_measurement
 from torchsph.haemodynamics import UNITS, FlowDomain, flow_quantities
+from torchsph.methods.members.amplitude import Amplitude
 from torchsph.methods.members.draws import spline_frames
 from torchsph.methods.members.frames import MemberFrames
 from torchsph.methods.members.kept import MemberFile, most_bytes, read_members, rounded
@@ -86,15 +87,18 @@ def test_looking_on_changes_no_bit(given, followed):
     np.testing.assert_array_equal(given.run().recording.velocity, followed[0].velocity)
 
 
-def test_members_lie_around_the_analysis_as_far_as_it_claims(followed):
+def test_members_lie_around_the_analysis_as_far_as_it_claims(given, followed):
+    """Beside the factor that each has on all but the flow that the walls drive."""
     recording, frames, _, _ = followed
+    amplitude = Amplitude(given.prepared.balance, given.prepared.amplitude_error, MEMBERS, seed=1)
+    assert 0 < given.prepared.amplitude_error < 0.5
     assert [frame.frame for frame in frames] == [0, 1, 2, 3]
     for frame in frames:
         np.testing.assert_array_equal(frame.field, recording.velocity[frame.frame])
         np.testing.assert_allclose(frame.members.mean(0), frame.field, atol=1e-6)
-        spread = frame.members.std(0, ddof=1)
-        np.testing.assert_allclose(spread, recording.sigma[frame.frame], atol=1e-6)
         inside = np.asarray(recording.mask[frame.frame], bool)
+        own = frame.members - inside * amplitude.of_fields(torch.from_numpy(frame.field), frame.frame).numpy()
+        np.testing.assert_allclose(own.std(0, ddof=1), recording.sigma[frame.frame], atol=1e-6)
         assert np.isfinite(frame.pressure[inside]).mean() > 0.99
         assert np.abs(frame.rate[:, inside]).mean() > 0 and (frame.member_rates[:, :, inside] != 0).any()
 
@@ -205,7 +209,9 @@ def test_rates_at_a_frame_from_both_sides_of_it(given):
     levels = [float(frame.rate[0, 1, 0, 0]) for frame in kept.frames]
     assert levels == [10.0, 15.0, 20.0, 30.0]  # ends: one side; frame 2: a valve shuts behind it
     assert [float(frame.rate[0, 0, 0, 0]) for frame in kept.frames] == [0.0, 7.0, 7.0, 7.0]
-    assert [float(frame.member_rates[1, 0, 1, 0, 0]) for frame in kept.frames] == [2.0, 2.5, 3.0, 4.0]
+    # members lie around the estimate as they lie around their own mean; one that failed has what the estimate has
+    assert [float(frame.member_rates[0, 0, 1, 0, 0]) for frame in kept.frames] == [9.0, 14.0, 19.0, 29.0]
+    assert [float(frame.member_rates[1, 0, 1, 0, 0]) for frame in kept.frames] == levels
     inside = np.asarray(recording.mask[1], bool)
     assert abs(kept.frames[1].pressure[inside].mean()) < 1e-2 and np.isnan(kept.frames[1].pressure[~inside]).all()
 

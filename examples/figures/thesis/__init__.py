@@ -1,0 +1,1 @@
+"""A script for each experiment: `make(material)` measures and says how it is drawn."""

@@ -1,0 +1,133 @@
+"""The notebook runs, the pages' numbers are those of the results, and the programs and tests they name are there."""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+
+import matplotlib
+import pytest
+from paths import ROOT
+
+if str(ROOT) not in sys.path:
+    sys.path.append(str(ROOT))
+
+RESULTS = ROOT / "examples" / "benchmarks" / "results"
+
+
+def text(name: str) -> str:
+    return (ROOT / name).read_text(encoding="utf-8")
+
+
+def result(name: str):
+    return json.loads((RESULTS / name).read_text(encoding="utf-8"))
+
+
+def short(value: float) -> str:
+    """.405"""
+    return f"{value:.3f}".removeprefix("0")
+
+
+def notebook() -> dict:
+    return json.loads(text("examples/quickstart.ipynb"))
+
+
+def test_the_notebook_runs_and_its_ensemble_is_best(tmp_path, monkeypatch):
+    matplotlib.use("Agg")
+    monkeypatch.chdir(tmp_path)
+    names: dict = {}
+    for number, cell in enumerate(notebook()["cells"]):
+        if cell["cell_type"] == "code":
+            exec(compile("".join(cell["source"]), f"quickstart.ipynb, cell {number}", "exec"), names)
+    assert names["errors"]["ensemble"] < names["errors"]["splines"] < names["errors"]["measured"]
+    assert (tmp_path / "analysis.h5").is_file()
+
+
+def test_the_notebook_is_one_and_carries_no_outputs():
+    nbformat = pytest.importorskip("nbformat", reason="pip install nbformat: validates the notebook's form")
+    nbformat.validate(nbformat.from_dict(notebook()))
+    assert not any(cell.get("outputs") for cell in notebook()["cells"])
+
+
+def test_errors_of_the_methods_are_those_of_the_results():
+    found = {
+        noise: result(f"filter_methods_{noise}.json")["measurements"][f"lv_phantom_a_{noise}"]
+        for noise in ("measured", "noisy")
+    }
+    settings, accuracy = text("torchsph/SETTINGS.md"), text("torchsph/ACCURACY.md")
+    for method in ("ensemble", "spline", "free", "sph"):
+        both = [short(found[noise][method]["nrmse"]) for noise in found]
+        assert re.search(rf"`{method}`.*\| {re.escape(both[0])} / {re.escape(both[1])} \| ", settings)
+    for method, name in (("raw", "measurement"), ("spline", "splines"), ("ensemble", "ensemble")):
+        cells = []
+        for noise in found:
+            row = found[noise][method]
+            value = short(row["nrmse"]) if row["nrmse"] < 1 else f"{row['nrmse']:.3f}"
+            cells.append(f"{value}, {row['direction_error_deg']:.0f}°")
+        assert f"| {name} | {cells[0]} | {cells[1]} |" in accuracy
+
+
+def test_errors_over_spacing_and_members_are_those_of_the_results():
+    settings = text("torchsph/SETTINGS.md")
+    for row in result("speed_error.json")["rows"]:
+        if row["flow"] == "ventricle" and row["curve"] == "projection":
+            assert f"| {row['resolution']} | {short(row['error'])} | {row['cpu_s']:.1f} |" in settings
+    for row in result("filter_sweeps.json")["rows"]:
+        error, splines = short(row["nrmse"]["ensemble"]), short(row["nrmse"]["spline"])
+        if row["sweep"].startswith("frame rate"):
+            assert f"| {row['value']} Hz | {splines} | {error} |" in settings
+        if row["sweep"] == "members":
+            assert re.search(rf"^\| {row['value']}(?: \(default\))? \| {re.escape(error)} \| ", settings, re.MULTILINE)
+
+
+def test_what_damage_costs_is_what_the_page_says():
+    for noise in ("measured", "noisy"):
+        for name, row in result(f"robustness_{noise}.json")["cases"].items():
+            assert row["ensemble"] < row["spline"] < row["gaussian"], name
+    cases = result("robustness_measured.json")["cases"]
+    small, half = (
+        100 * (cases[name]["ensemble"] / cases["as it is"]["ensemble"] - 1)
+        for name in ("walls too small, .94", "half of the sector missing")
+    )
+    page = text("examples/STABILITY.md").replace("\n", " ")
+    assert f"walls that are 6 % too small cost {small:.0f} % of error" in page
+    assert f"half of a sector that is missing {half:.0f} %" in page
+
+
+def test_hard_cases_of_the_page_are_tests():
+    named = re.findall(r"`(tests/[\w/]+\.py)::(\w+)`", text("examples/STABILITY.md"))
+    assert len(named) > 20
+    assert not [f"{file}::{name}" for file, name in named if f"def {name}(" not in text(file)]
+
+
+def test_every_hard_case_is_on_the_page():
+    page = text("examples/STABILITY.md")
+    for file in ("simulator/test_hard_cases.py", "assimilation/test_hard_cases.py"):
+        for name in re.findall(r"^def (test_\w+)", text(f"tests/torchsph/{file}"), re.MULTILINE):
+            assert name in page or "untuned_inflation" in name, name
+
+
+def test_every_program_is_on_the_page():
+    page = text("examples/README.md")
+    assert not [f.name for f in (ROOT / "examples" / "programs").glob("*.py") if f"(programs/{f.name})" not in page]
+
+
+def test_pages_that_are_written_are_current():
+    from examples.figures.table import page as figures
+    from examples.rivals.__main__ import TABLE, load
+    from examples.rivals.__main__ import page as rivals
+
+    assert text("examples/figures/README.md") == figures(ROOT / "examples" / "figures" / "results")
+    assert text("examples/rivals/README.md") == rivals(load(TABLE))
+
+
+def test_the_picture_of_the_readme_is_drawn_from_the_results_that_are_there():
+    from PIL import Image
+
+    from examples.error_seconds import forecasts, front, inputs_hash
+
+    with Image.open(ROOT / "examples" / "error_seconds.png") as picture:
+        assert picture.info["Comment"] == inputs_hash(), "redraw it: python examples/error_seconds.py"
+    best = front(forecasts())
+    assert all(a.seconds < b.seconds and a.error > b.error for a, b in zip(best, best[1:], strict=False))
