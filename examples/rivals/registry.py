@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from .methods import gaussian, ivfm, leray, pinn, siren, smoothn, temporal
+from .methods import denoiser, gaussian, ivfm, leray, pinn, siren, smoothn, temporal
 
 
 @dataclass(frozen=True)
@@ -60,6 +60,7 @@ RIVALS: dict[str, Rival] = {
         {"width": (5e-3, 1e-2), "smoothness": (1.0, 2.0), "divergence": (10.0,), "wall": (3.0,)},
         {"on": ivfm.fit},
     ),
+    "denoiser": Rival(denoiser.fit, "convolutions trained on simulated flows", {"flows": (4,), "steps": (300,)}),
     "siren": Rival(
         siren.fit,
         "neural field as a curl, after DAF-FlowNet (arXiv 2604.00205)",

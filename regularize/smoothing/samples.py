@@ -122,7 +122,7 @@ class FitData:
         """Volume (area in 2-D) that samples and walls span, in m^D; 0 where they lie in one plane."""
         cloud = self.points if self.wall is None else torch.cat([self.points, self.wall.points])
         try:
-            return float(ConvexHull(cloud[:, : self.components].double().cpu().numpy()).volume)
+            return float(ConvexHull(cloud[:, : self.components].detach().double().cpu().numpy()).volume)
         except (QhullError, ValueError):  # fewer than D + 1 points, or all in one plane
             return 0.0
 

@@ -247,7 +247,7 @@ def show(result: dict[str, Any]) -> None:
     """Print everything, one row a line."""
     for table, rows in result.items():
         if not isinstance(rows, dict):
-            print(f"{table}: {rows:.3g}")
+            print(f"{table}: {rows if isinstance(rows, str) else format(rows, '.3g')}")
             continue
         print(table)
         for name, row in rows.items():

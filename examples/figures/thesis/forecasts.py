@@ -55,6 +55,7 @@ def _case(
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of volume that shut valves cannot let through
         found = ts.skill(truth, model, [1 / rate for rate in rates], save=True, seed=material.seed, **starts)
+    # starts that failed, because volume was lost, count nowhere
     return {
         "nrmse": [row["nrmse"]["model"] for row in found.leads],
         "persistence": [row["nrmse"]["persistence"] for row in found.leads],
