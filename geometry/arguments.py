@@ -182,8 +182,8 @@ def _is_plain(value: np.ndarray | torch.Tensor) -> bool:
 def _holds_nan(value: Any) -> bool:
     """Whether there is a NaN among numbers in tuples and lists."""
     if isinstance(value, tuple | list):
-        return any(_holds_nan(part) if isinstance(part, tuple | list) else part != part for part in value)
-    return False
+        return any(map(_holds_nan, value))
+    return isinstance(value, float) and math.isnan(value)
 
 
 def _is_among(value: Any, allowed: tuple[Any, ...]) -> bool:
@@ -231,7 +231,7 @@ class _Check:
             endless = self.rule is not None and self.rule.endless and not math.isnan(found)
             if not endless and not (isinstance(self.default, float) and str(self.default) == str(found)):
                 raise WrongValue(self._words("finite", value))
-        if _holds_nan(found):
+        if isinstance(found, tuple | list) and _holds_nan(found):
             raise WrongValue(self._words("without NaN", value))
         if self.rule is not None and found is not None and not self.rule.fits(found):
             raise WrongValue(self._words(self.rule.words, found))

@@ -19,7 +19,24 @@ from .placing import fill_scalar, fill_vectors
 from .source import ArrayLike, FormatError, Source
 
 MIRROR = {"ras": np.array([-1.0, -1.0, 1.0])}  # to LPS, the coordinates that DICOM, ITK and surfaces of Slicer use
-WHOLE = (".h5", ".hdf5", ".hdf", ".he5", ".mat", ".npz", ".vtkhdf", ".nc", ".nc4", ".nii", ".gz", ".nrrd", ".mha", ".vti", ".vtk", ".zarr")
+WHOLE = (
+    ".h5",
+    ".hdf5",
+    ".hdf",
+    ".he5",
+    ".mat",
+    ".npz",
+    ".vtkhdf",
+    ".nc",
+    ".nc4",
+    ".nii",
+    ".gz",
+    ".nrrd",
+    ".mha",
+    ".vti",
+    ".vtk",
+    ".zarr",
+)
 DECLARED = 64 * 2**30  # bytes; a file that claims a larger result is refused before anything is read
 
 
@@ -259,7 +276,7 @@ def _scalar(
         )
     if size.get("t", 1) not in (1, frames):
         raise FormatError(f"{source.path}: {name} has {size['t']} frames, the velocity {frames}")
-    result = np.empty((frames, *(counts[lie.order[axis]] for axis in reversed(range(len(counts))))), kind)
+    result: np.ndarray = np.empty((frames, *(counts[lie.order[axis]] for axis in reversed(range(len(counts))))), kind)
     fill_scalar(result, source.arrays[name], letters, source.attributes.get(name, {}), lie, made)
     return result
 

@@ -13,7 +13,7 @@ from geometry.grids.grid import Grid
 from geometry.recordings.read import read_recording
 from geometry.recordings.recording import Recording, Wall
 from geometry.recordings.units import factor
-from geometry.surfaces.files import SUFFIXES
+from geometry.surfaces.files import holds_surface
 
 from .assemble import Fields
 from .displacement import MotionOptions
@@ -108,7 +108,7 @@ def convert(
     text_of = description or f"converted from {paths[0].name}" + (
         f" and {len(paths) - 1} more" if len(paths) > 1 else ""
     )
-    if not format and all(path.suffix.lower() in SUFFIXES for path in paths):
+    if not format and all(path.is_file() and holds_surface(path) for path in paths):
         return _walls_alone(paths, said, wall, about, text_of)
     if len(paths) == 1 and not format and _is_recording(paths[0]):
         return Converted(read_recording(paths[0]))

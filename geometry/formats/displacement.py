@@ -1,13 +1,13 @@
 """A wall that moves by displacements: of a field on a grid over time, or of each vertex.
 
 A displacement tells how far a point of the surface file is from its place there, at each frame: x(t) = X + u(X, t).
-Between nodes a field is interpolated linearly along each axis, as ITK does by default, and between its times linearly in
-time. A vertex outside of the field, or beside a node without a value, is refused: nothing is extrapolated.
+Between nodes a field is interpolated linearly along each axis, as ITK does by default, and between its times linearly
+in time. A vertex outside of the field, or beside a node without a value, is refused: nothing is extrapolated.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -32,7 +32,8 @@ class MotionOptions:
     Attributes:
         files: one, or one for each frame in order of time; none: the wall does not move by displacements.
         said: the field map of the files, in which `velocity` names the displacements.
-        unit: of the displacements, a name or a number of metres; "": that of the file's lengths, else the wall's.
+        unit: of the displacements, a name or a number of metres; "": what their attribute `units` says, else that of
+            the file's lengths, else the wall's.
     """
 
     files: tuple[str, ...] = ()
@@ -95,13 +96,13 @@ def read_displacements(options: MotionOptions, vertices: np.ndarray, wall_unit: 
     source = open_source(paths[0], said)
     names = tuple(said.velocity) or tuple(source.roles.get("velocity", ()))
     try:
-        unit = factor(options.unit, "length") if options.unit else said.unit("length") or source.length or wall_unit
+        unit = _unit(options, source, names, wall_unit)
         timed = source.time is not None or bool(said.time) or said.interval is not None or said.period > 0
         if len(paths) == 1 and len(names) == 1 and _of_vertices(source, names[0], len(vertices)):
             return _by_vertices(source, names[0], vertices, unit, said)
     finally:
         source.close()
-    said = replace(said, velocity_unit=repr(unit), **({} if timed else {"interval": 1.0}))
+    said = replace(said, velocity_unit=repr(unit), interval=said.interval if timed else 1.0)
     fields = read_fields(paths, said, "")
     if fields.grid.dimension != 3:
         raise FormatError(f"{paths[0]}: displacements must have three components on a grid of three axes")
@@ -110,6 +111,19 @@ def read_displacements(options: MotionOptions, vertices: np.ndarray, wall_unit: 
         fields.time if timed else None,
         len(fields.time),
     )
+
+
+def _unit(options: MotionOptions, source: Source, names: Sequence[str], wall_unit: float) -> float:
+    """Metres per unit of the displacements: as said, as their attribute `units` says, as of the lengths beside them."""
+    if options.unit:
+        return factor(options.unit, "length")
+    stated = source.attributes.get(names[0], {}).get("units") if names else None
+    if stated is None or not str(stated).strip():
+        return options.said.unit("length") or source.length or wall_unit
+    try:
+        return factor(stated.decode() if isinstance(stated, bytes) else str(stated), "length")
+    except ValueError as fault:
+        raise FormatError(f"{source.path}: {names[0]}: its attribute units: {fault} (--motion-unit)") from fault
 
 
 def _of_vertices(source: Source, name: str, count: int) -> bool:
@@ -134,7 +148,7 @@ def _by_vertices(source: Source, name: str, vertices: np.ndarray, unit: float, s
     values = unit * np.transpose(values, [*times, order[0], components[0]]).reshape(-1, len(vertices), 3)
     if not np.isfinite(values).all():
         raise FormatError(f"{source.path}: {name}: must be finite for every vertex")
-    time = None
+    time: np.ndarray | None = None
     if isinstance(said.time, str) and said.time in source.arrays:
         time = np.asarray(source.arrays[said.time][(...,)], np.float64).reshape(-1) * (said.unit("time") or 1.0)
     elif isinstance(said.time, tuple) and said.time:
@@ -147,7 +161,7 @@ def _by_vertices(source: Source, name: str, vertices: np.ndarray, unit: float, s
 
 
 def _sampled(grid: Grid, field: np.ndarray, turn: np.ndarray, points: np.ndarray, path: Path) -> np.ndarray:
-    """Displacements (T, n, 3), m, of points in the file's coordinates; the grid and its field are turned back by `turn`."""
+    """Displacements (T, n, 3), m, of points in the file's coordinates, by a grid and field turned back by `turn`."""
     places = points @ turn
     low, high = np.asarray(grid.origin), np.asarray(grid.upper)
     beyond = np.maximum(low - places, places - high).max(axis=1)
@@ -186,5 +200,3 @@ def _between(places: np.ndarray, own: np.ndarray, time: np.ndarray, period: floa
     after = np.clip(np.searchsorted(own, time), 1, len(own) - 1)
     share = np.clip((time - own[after - 1]) / (own[after] - own[after - 1]), 0, 1)[:, None, None]
     return (1 - share) * places[after - 1] + share * places[after]
-
-

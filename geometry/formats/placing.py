@@ -88,9 +88,9 @@ def fill_vectors(
             plain = unpacked(values, about) * unit
             first = where[1].start if len(arrays) == 1 else number
             for component in range(first, min(first + values.shape[1], result.shape[1])):
-                for axis in np.flatnonzero(matrix[:, component]):
+                for axis in np.flatnonzero(matrix[:, component]).tolist():
                     turned = matrix[axis, component] * plain[:, component - first]
-                    result[(where[0], axis, *where[2:])] += np.asarray(turned, np.float32)
+                    result[where[0], axis][(slice(None), *where[2:])] += np.asarray(turned, np.float32)
 
 
 def fill_scalar(

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from geometry.arguments import checked
+from geometry.arguments import checked, shown
 from geometry.grids.grid import Grid
 from geometry.surfaces.integers import narrowed
 from geometry.surfaces.surface import Surface
@@ -276,11 +276,11 @@ def _check_kinds(recording: Recording) -> None:
         kind = "a tuple of OpeningFlux" if name == "fluxes" else f"a {dict(kinds)[name]}"
         raise TypeError(f"Recording: {name} must be {kind}, got {type(getattr(recording, name)).__name__}")
     for name in ("rho", "mu", "period"):
+        value = getattr(recording, name)
         try:
-            object.__setattr__(recording, name, float(getattr(recording, name)))
-        except (TypeError, ValueError):
-            value = getattr(recording, name)
-            raise TypeError(f"Recording: {name} must be a number, got {value!r:.60}") from None
+            object.__setattr__(recording, name, float(value))
+        except (TypeError, ValueError, OverflowError, RuntimeError):
+            raise TypeError(f"Recording: {name} must be a number, got {shown(value)}") from None
 
 
 def _coerce(instance: Wall | Recording, prefix: str) -> None:

@@ -1,4 +1,4 @@
-"""Surfaces from and to files: STL, OBJ, PLY, VTP."""
+"""Surfaces from and to files: STL, OBJ, PLY, VTP, legacy VTK."""
 
 from __future__ import annotations
 
@@ -25,6 +25,7 @@ READERS: dict[str, Callable[[Path], Polygons]] = {
     ".obj": read_obj,
     ".ply": read_ply,
     ".vtp": read_vtk_polygons,
+    ".vtk": read_vtk_polygons,
 }
 SUFFIXES = tuple(READERS)
 WRITTEN = (".stl", ".obj", ".ply")
@@ -42,7 +43,7 @@ def read_surface(
     sheet: str = "",
     hole_region: int | Sequence[int] = 0,
 ) -> Surface:
-    """The triangles of a STL, OBJ, PLY or VTP file as a closed outward surface.
+    """The triangles of a STL, OBJ, PLY, VTP or legacy VTK file as a closed outward surface.
 
     Args:
         path: the file. Polygons of more corners are cut into triangles, which keep their polygon's label.
@@ -90,6 +91,15 @@ def read_surface(
 
 
 @checked
+def holds_surface(path: Path) -> bool:
+    """Whether a file is one of surfaces, by the end of its name and, for legacy VTK, by what it says it holds."""
+    suffix = path.suffix.lower()
+    if suffix != ".vtk":
+        return suffix in READERS
+    with path.open("rb") as file:
+        return b"POLYDATA" in file.read(1024).upper()
+
+
 def write_surface(path: str | Path, surface: Surface, *, scale: float = 1.0) -> None:
     """Write a 3-D surface as STL, OBJ or PLY by suffix, in units of `scale` (m); PLY keeps the regions."""
     path = Path(path)

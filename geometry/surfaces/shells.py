@@ -7,7 +7,7 @@ that the material surrounds in most directions: the lumen. Around a body of bloo
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
 
@@ -31,6 +31,7 @@ CLEARLY = 0.75  # the same, of the middle face of a smooth patch that belongs to
 SHARP = 40.0  # degrees between faces, beyond which a patch ends
 MIXED = 0.1  # part of a patch's area that decides otherwise, above which it is cut
 BEYOND = 0.15  # part of what the inner sheet holds that may be material or lie beyond the lumen, along voxels
+AT_A_TIME = 10_000  # points
 DIRECTIONS = [step for step in product((-1, 0, 1), repeat=3) if any(step)]
 
 
@@ -81,8 +82,8 @@ def refuse_shells(surface: Surface) -> None:
     if shell is not None:
         raise SurfaceError(
             f"is a wall of finite thickness: {1e6 * shell.material:.3g} ml of material around "
-            f"{1e6 * shell.lumen:.3g} ml; take its inner sheet: sheet='inner' (convert --sheet inner), or, if the blood "
-            "is what it encloses, keep it whole: sheet='all'"
+            f"{1e6 * shell.lumen:.3g} ml; take its inner sheet: sheet='inner' (convert --sheet inner), or, if the "
+            "blood is what it encloses, keep it whole: sheet='all'"
         )
 
 
@@ -111,7 +112,9 @@ def inner_sheet(surface: Surface, *, hole_region: int | Sequence[int] = 0) -> Su
     try:
         result = repaired(_part(surface, faces), hole_region=hole_region)
     except SurfaceError as fault:
-        raise SurfaceError(f"is a wall whose inner sheet cannot be told from its rim ({fault}); cut it there") from fault
+        raise SurfaceError(
+            f"is a wall whose inner sheet cannot be told from its rim ({fault}); cut it there"
+        ) from fault
     held = grid_winding(voxels.grid, result.vertices, result.faces) > 0
     beyond = held & (voxels.inside | (~voxels.block & (voxels.seen < FACING)))
     if (held & voxels.lumen).sum() < HELD * voxels.lumen.sum() or beyond.sum() > BEYOND * held.sum():
@@ -133,12 +136,12 @@ def _voxels(surface: Surface) -> _Voxels:
     grid = Grid.covering(tuple(lower - 2 * step), tuple(upper + 2 * step), step)
     inside = grid_winding(grid, surface.vertices, surface.faces) > 0
     block = inside.copy()
-    place = np.rint((_points_on(surface, 0.5 * step) - grid.origin) / step).astype(int)
-    block[tuple(place.T[::-1])] = True
-    seen = np.zeros(grid.shape, np.float32)
+    for points in _points_on(surface, 0.5 * step):
+        block[tuple(np.rint((points - grid.origin) / step).astype(np.int32).T[::-1])] = True
+    seen = np.zeros(grid.shape, np.uint8)
     for direction in DIRECTIONS:
         seen += _sees(block, direction)
-    return _Voxels(grid, inside, block, seen / len(DIRECTIONS))
+    return _Voxels(grid, inside, block, seen / np.float32(len(DIRECTIONS)))
 
 
 def _sees(block: np.ndarray, direction: tuple[int, ...]) -> np.ndarray:
@@ -165,18 +168,18 @@ def _shifted(values: np.ndarray, direction: tuple[int, ...], steps: int) -> np.n
     return result
 
 
-def _points_on(surface: Surface, distance: float) -> np.ndarray:
-    """Points on the faces, no farther apart than a distance (m)."""
+def _points_on(surface: Surface, distance: float) -> Iterator[np.ndarray]:
+    """Points (n, 3) on the faces, no farther apart than a distance (m), some faces at a time."""
     corner = surface.vertices[surface.faces]
     longest = np.linalg.norm(corner - np.roll(corner, 1, axis=1), axis=2).max(axis=1)
     parts = np.maximum(np.ceil(longest / distance), 1).astype(int)
-    found = []
     for count in np.unique(parts):
         i, j = np.meshgrid(np.arange(count + 1), np.arange(count + 1), indexing="ij")
         kept = (i + j) <= count
         share = np.stack([i[kept], j[kept], count - i[kept] - j[kept]], axis=1) / count
-        found.append(np.einsum("pk,fkd->fpd", share, corner[parts == count]).reshape(-1, 3))
-    return np.concatenate(found)
+        faces = np.flatnonzero(parts == count)
+        for some in np.array_split(faces, -(-len(faces) * len(share) // AT_A_TIME)):
+            yield np.einsum("pk,fkd->fpd", share, corner[some]).reshape(-1, 3)
 
 
 def _patches(surface: Surface) -> np.ndarray:
@@ -198,9 +201,9 @@ def _facing(surface: Surface, voxels: _Voxels) -> np.ndarray:
     seen = np.full(len(surface.faces), np.nan)
     for reach in (1.5, 2.0, 1.0):  # the first open node in front of a face
         place = np.rint((surface.centroids + reach * step * surface.normals - grid.origin) / step).astype(int)
-        place = tuple(np.clip(place, 0, np.array(grid.shape[::-1]) - 1).T[::-1])
-        free = np.isnan(seen) & ~voxels.block[place]
-        seen[free] = voxels.seen[place][free]
+        node = tuple(np.clip(place, 0, np.array(grid.shape[::-1]) - 1).T[::-1])
+        free = np.isnan(seen) & ~voxels.block[node]
+        seen[free] = voxels.seen[node][free]
     seen = np.nan_to_num(seen, nan=1.0)
     facing = seen >= FACING
     patch = _patches(surface)

@@ -17,7 +17,10 @@ from regularize.errors import InvalidInput
 
 DEGREES = (1, 2, 3, 4, 5)
 MOST_DISTANCE = 1e6  # of a place in its interval, whose fifth power float32 still holds
-NEAR = Rule(f"finite and within {MOST_DISTANCE:g} of 0", lambda t: bool((t.abs() <= MOST_DISTANCE).all()))
+NEAR = Rule(
+    f"floating point, finite and within {MOST_DISTANCE:g} of 0",
+    lambda t: t.is_floating_point() and bool((t.abs() <= MOST_DISTANCE).all()),
+)
 MOST_ORDER = 6  # of derivatives: one more than the highest degree has is 0
 
 
@@ -75,8 +78,6 @@ def basis(t: torch.Tensor, degree: int, order: int = 0) -> torch.Tensor:
     Raises:
         InvalidInput: t is no tensor of finite real numbers, or there is no such degree or derivative.
     """
-    if not t.is_floating_point():
-        raise InvalidInput(f"basis: t is of {t.dtype}: it must hold real numbers")
     return basis_at(t, degree, order)
 
 

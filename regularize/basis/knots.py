@@ -67,6 +67,11 @@ class Knots:
         origin = tuple((a + b - n * h) / 2 for a, b, h, n in zip(lower, upper, spacing, cells, strict=True))
         return cls(origin, tuple(float(h) for h in spacing), cells, degree)
 
+    def spread_out(self, factor: float) -> "Knots":
+        """Knots over the same box, ``factor`` times as far apart."""
+        upper = [o + h * n for o, h, n in zip(self.origin, self.spacing, self.cells, strict=True)]
+        return Knots.covering(self.origin, upper, [factor * h for h in self.spacing], self.degree)
+
     @property
     def axes(self) -> int:
         """A."""

@@ -12,12 +12,13 @@ from typing import Protocol
 
 import torch
 
-from regularize.arguments import checked
+from regularize.arguments import Rule, checked
 from regularize.basis.knots import Knots
 from regularize.errors import InvalidInput
 
 from .given import check_real
 
+PLACES = Rule("of the shape (n, A)", lambda points: points.ndim == 2)
 CHUNK = 4096  # points per pass: bounds the (points, local_size, C) buffers to a few megabytes
 
 
@@ -86,7 +87,7 @@ def at_points(block: "RowBlock") -> PointRows:
 class VectorRows(PointRows):
     """Rows w_ik v_k(x_i) = w_ik target_ik, one per point and component (the matrix S of Grønli 2017, eq. 3.7)."""
 
-    @checked
+    @checked(points=PLACES)
     def __init__(self, knots: Knots, points: torch.Tensor, target: torch.Tensor, weight: torch.Tensor) -> None:
         for name, values in (("points", points), ("target", target), ("weight", weight)):
             check_real(name, values)
@@ -193,7 +194,7 @@ class _CoupledRows(PointRows):
 class DirectionRows(_CoupledRows):
     """Rows w_i d_i . v(x_i): wall normals (Grønli 2017, eq. 3.21), Doppler beams. direction (n, C), target (n,)."""
 
-    @checked
+    @checked(points=PLACES)
     def __init__(
         self,
         knots: Knots,
@@ -222,7 +223,7 @@ class DirectionRows(_CoupledRows):
 class DivergenceRows(_CoupledRows):
     """Rows w_i div v(x_i) = 0, derivatives per metre (Grønli 2017, eq. 3.13)."""
 
-    @checked
+    @checked(points=PLACES)
     def __init__(self, knots: Knots, points: torch.Tensor, components: int, weight: torch.Tensor) -> None:
         check_real("points", points)
         super().__init__(knots, points, components, points.new_zeros(points.shape[:1]), weight)

@@ -117,7 +117,7 @@ class SplineField:
         return points.to(self.coefficients)
 
     def _evaluate(self, points: torch.Tensor, orders: list, outside: float) -> list[torch.Tensor]:
-        if not isinstance(outside, int | float):
+        if not isinstance(outside, int | float) or (isinstance(outside, int) and abs(outside) >= 2**1023):
             raise InvalidInput(f"outside is {outside!r:.60}: it must be a number, as nan or 0.0")
         points = self._checked(points)
         supported = self.supported(points)

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from math import prod
 from typing import Any
 
@@ -94,27 +95,34 @@ class FitData:
         each = (precision / precision.mean()).sqrt().to(self.points)
         # discarded samples stay as rows of weight 0: the field remains defined where they lie
         factor = choice.robust.sqrt().to(self.weight)
-        return replace(self, weight=self.weight * factor, component_weight=each)
+        return self._at_the_same_points(weight=self.weight * factor, component_weight=each)
+
+    def _at_the_same_points(self, **changes: Any) -> "FitData":
+        """A copy with changes that leave the points where they are."""
+        other = replace(self, **changes)
+        vars(other)["volume"] = self.volume  # the hull of all points takes as long as assembling the rows
+        return other
 
     def cpu(self) -> "FitData":
         """The same data on the CPU."""
         move: dict[str, Any] = {name: v.cpu() for name, v in vars(self).items() if isinstance(v, torch.Tensor)}
         wall = None if self.wall is None else self.wall.to(torch.float64, "cpu")
-        return replace(self, wall=wall, **move)
+        return self._at_the_same_points(wall=wall, **move)
 
     def extent(self, knots: Knots) -> float:
         """Volume (times duration) over which penalties are averaged; one knot cell's for flat data."""
-        volume = self.volume() or prod(knots.spacing[: self.components])
+        volume = self.volume or prod(knots.spacing[: self.components])
         if not self.over_time:
             return volume
         times = self.points[:, -1]
         return volume * (float(times.max() - times.min()) or knots.spacing[-1])
 
+    @cached_property
     def volume(self) -> float:
         """Volume (area in 2-D) that samples and walls span, in m^D; 0 where they lie in one plane."""
         cloud = self.points if self.wall is None else torch.cat([self.points, self.wall.points])
         try:
-            return float(ConvexHull(cloud[:, : self.components].double().cpu().numpy()).volume)
+            return float(ConvexHull(cloud[:, : self.components].detach().double().cpu().numpy()).volume)
         except (QhullError, ValueError):  # fewer than D + 1 points, or all in one plane
             return 0.0
 

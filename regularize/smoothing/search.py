@@ -10,13 +10,15 @@ from regularize.rows.operators import CellRows, DivergenceRows, VectorRows
 from regularize.rows.penalties import row_factor
 from regularize.solvers.direct import solve_direct
 from regularize.statistics.gcv import cross_validate
-from regularize.statistics.likelihood import Choice, Groups, LikelihoodSearch
+from regularize.statistics.likelihood import Choice, Groups, LikelihoodSearch, Start
 
 from .problem import Problem
 from .row_blocks import build_system, penalty_blocks, smoothness_gram, wall_roots
 from .samples import FitData
 
 FEWEST = 30  # below this the estimates scatter by more than the choice could gain
+COARSER = 1.5  # the search begins on knots so much farther apart, where a round costs a fraction
+WORTH_COARSER = 600  # unknowns above which it does
 
 
 def choose(options: SplineOptions, knots: Knots, data: FitData) -> Choice | None:
@@ -28,9 +30,22 @@ def choose(options: SplineOptions, knots: Knots, data: FitData) -> Choice | None
     guess = 0.5 * float(data.velocity.double().square().mean().sqrt())
     if len(data.points) < FEWEST or guess == 0:
         return None
-    spacing = [options.search_knots * h for h in knots.spacing]
-    upper = [o + h * n for o, h, n in zip(knots.origin, knots.spacing, knots.cells, strict=True)]
-    coarse = Knots.covering(knots.origin, upper, spacing, knots.degree)
+    coarse = knots.spread_out(options.search_knots)
+    with torch.no_grad():
+        search = _search(options, coarse, data)
+        if options.automatic == "gcv":
+            return cross_validate(search, options.no_slip, options.rounds)
+        divergence = length_of(options.divergence) if options.divergence is not None else None
+        start = Start(guess, length_of(options.curvature), options.no_slip, divergence)
+        if search.unknowns > WORTH_COARSER:
+            fewer = _search(options, knots.spread_out(COARSER * options.search_knots), data)
+            start = fewer.run(start, options.rounds).start
+        choice = search.run(start, options.rounds)
+        return _counting_shared_errors(options, coarse, data, choice) if options.correlated else choice
+
+
+def _search(options: SplineOptions, coarse: Knots, data: FitData) -> LikelihoodSearch:
+    """The search on the rows of a knot grid."""
     fit = VectorRows(coarse, data.points, data.velocity, data.weight[:, None])
     rest = options.fixed(no_slip=None, curvature=None, choose_divergence=False)
     free = options.choose_divergence and bool(options.divergence)
@@ -53,13 +68,7 @@ def choose(options: SplineOptions, knots: Knots, data: FitData) -> Choice | None
         [block for block in blocks if block not in chosen],
         damping,
     )
-    search = LikelihoodSearch(coarse, groups, options.robust)
-    with torch.no_grad():
-        if options.automatic == "gcv":
-            return cross_validate(search, options.no_slip, options.rounds)
-        divergence = length_of(options.divergence) if options.divergence is not None else None
-        choice = search.run(guess, length_of(options.curvature), options.no_slip, divergence, options.rounds)
-        return _counting_shared_errors(options, coarse, data, choice) if options.correlated else choice
+    return LikelihoodSearch(coarse, groups, options.robust)
 
 
 def _counting_shared_errors(options: SplineOptions, coarse: Knots, data: FitData, choice: Choice) -> Choice:

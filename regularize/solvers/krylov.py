@@ -97,7 +97,7 @@ def lsqr(
         NotConverged: when the true relative gradient stays above ``tolerance``, unless ``strict`` is False.
     """
     limits = Limits(tolerance, max_iterations, strict)
-    return iterate("lsqr", _run, matvec, rmatvec, b, weight, damping, limits)
+    return iterate("lsqr", _run, matvec, rmatvec, b, weight, float(damping), limits)
 
 
 def iterate(

@@ -31,7 +31,7 @@ def lsmr(
 ) -> Solution:
     """Minimise |w * (A x - b)|^2 + damping^2 |x|^2; arguments and errors as :func:`regularize.lsqr`."""
     limits = Limits(tolerance, max_iterations, strict)
-    return iterate("lsmr", _run, matvec, rmatvec, b, weight, damping, limits)
+    return iterate("lsmr", _run, matvec, rmatvec, b, weight, float(damping), limits)
 
 
 def _run(process: GolubKahan, aim: float, limit: int) -> tuple[torch.Tensor, int]:

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from scipy.optimize import minimize_scalar
+from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
 from regularize.rows.operators import System, VectorRows
@@ -69,7 +70,7 @@ class _Pairs:
         cut = torch.maximum(torch.minimum(residual, far), -far)
         deviation, fits = cut.square().mean((0, 2)).sqrt(), []
         for k in range(len(deviation)):
-            e = (cut[:, k] / deviation[k]).numpy()
+            e = (cut[:, k] / deviation[k]).float().numpy()  # half of the memory to gather pairs from
             together = np.einsum("pd,pd->p", e[self.first], e[self.second]) / e.shape[1]
             fits.append(self._gaussian(np.bincount(self.place, together, BINS) / np.maximum(self.count, 1)))
         share, length = torch.tensor(fits, dtype=torch.float64).unbind(1)
@@ -109,14 +110,16 @@ class CorrelatedErrors:
         if not isinstance(fit, VectorRows):
             raise TypeError(f"correlated errors are those of full vectors, not of {type(fit).__name__}")
         self.fit = fit
-        self.rows = self.fit.with_unit_weight().repeated(DRAWS * system.components)
+        self.matrix = _matrix(fit, ordering)
+        self.adjoint = self.matrix.T.tocsr()
         self.weight = weight[:, None, None]
         self.points = torch.tensor(self.fit.knots.spacing) * (self.fit.cell + self.fit.t)
         generator = torch.Generator().manual_seed(0)  # the same data give the same deviations
         shape = (system.components, WAVES, DRAWS)
         self.white = torch.randn(len(self.fit), system.components, DRAWS, generator=generator, dtype=torch.float64)
-        self.waves = torch.randn(self.fit.knots.axes, *shape, generator=generator, dtype=torch.float64)
-        self.phase = 2 * torch.pi * torch.rand(shape, generator=generator, dtype=torch.float64)
+        # in single precision: the cosines of all waves are most of the work, and draws need no more
+        self.waves = torch.randn(self.fit.knots.axes, *shape, generator=generator, dtype=torch.float64).float()
+        self.phase = (2 * torch.pi * torch.rand(shape, generator=generator, dtype=torch.float64)).float()
         self.generator = generator
 
     def inflation(self, residual: torch.Tensor) -> torch.Tensor:
@@ -147,24 +150,35 @@ class CorrelatedErrors:
 
     def _field(self, errors: Correlation) -> torch.Tensor:
         """(n, C, DRAWS) of variance 1: white, and plane waves with the spectrum of the correlated part."""
-        share, smooth = errors.share[:, None], torch.empty_like(self.white)
+        share, smooth, points = errors.share[:, None], torch.empty_like(self.white), self.points.float()
         for k in range(self.system.components):
-            wave = (self.points @ self.waves[:, k].flatten(1)).view(-1, WAVES, DRAWS) / errors.length[k]
-            smooth[:, k] = torch.cos(wave + self.phase[k]).sum(1) * (2 / WAVES) ** 0.5
+            waves = self.waves[:, k].flatten(1) / float(errors.length[k])
+            phases = torch.addmm(self.phase[k].flatten(), points, waves)
+            smooth[:, k] = phases.cos_().view(-1, WAVES, DRAWS).sum(1) * (2 / WAVES) ** 0.5
         return share.sqrt() * smooth + (1 - share).sqrt() * self.white
 
     def _pulled(self, rows: torch.Tensor) -> torch.Tensor:
-        """Right-hand sides (nodes, C, DRAWS) of weighted sample values (n, C, DRAWS)."""
-        pulled = self.rows.rmatvec((self.fit.weight[:, :, None] * rows).flatten())
-        return pulled.view(len(pulled), *rows.shape[1:])
+        """Right-hand sides (active, C, DRAWS) in solve order of weighted sample values (n, C, DRAWS)."""
+        pulled = self.adjoint @ (self.fit.weight[:, :, None] * rows).flatten(1).numpy()
+        return torch.from_numpy(pulled).view(-1, *rows.shape[1:])
 
     def _fitted(self, right: torch.Tensor) -> torch.Tensor:
-        """Fields (n, C, DRAWS) at the samples for right-hand sides (nodes, C, DRAWS)."""
-        return self._at_samples(self.factor.solve(right[self.ordering.nodes]))
+        """Fields (n, C, DRAWS) at the samples for right-hand sides (active, C, DRAWS) in solve order."""
+        return self._at_samples(self.factor.solve(right))
 
     def _at_samples(self, x: torch.Tensor) -> torch.Tensor:
         """Fields (n, C, DRAWS) at the samples of coefficients (active, C, DRAWS) in solve order."""
-        return self.rows.matvec(self.ordering.expand(x).flatten(1)).view(len(self.fit), *x.shape[1:])
+        return torch.from_numpy(self.matrix @ x.flatten(1).numpy()).view(-1, *x.shape[1:])
+
+
+def _matrix(fit: VectorRows, ordering: Ordering) -> csr_array:
+    """(n, active) values of the coefficients' functions, in solve order, at the samples."""
+    nodes, values = fit.knots.local_nodes(fit.cell), fit.rows_at(slice(None)).double()
+    place = torch.empty(fit.knots.nodes, dtype=torch.int64)
+    place[ordering.nodes] = torch.arange(len(ordering.nodes))
+    starts = np.arange(0, nodes.numel() + 1, nodes.shape[1])
+    shape = (len(nodes), len(ordering.nodes))
+    return csr_array((values.flatten().numpy(), place[nodes].flatten().numpy(), starts), shape=shape)
 
 
 def _towards(errors: Correlation, seen: Correlation, left: Correlation) -> Correlation:

@@ -12,7 +12,9 @@ level is read off scales that the spline resolves, where correlated noise looks 
 finer scales, which tells nothing about them, drops out.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from math import exp, log
 from typing import NamedTuple
 
 import torch
@@ -30,6 +32,7 @@ PROBES = 8  # random sums of rows per trace: its error is about sqrt(2 / (PROBES
 RELAXATION = 1.6  # the plain update converges from one side at a rate near 0.6
 UNLIKE = 10.0  # no component is taken for more than this many times noisier than another
 MOST_PER_ROUND = 1e3  # growth of a precision, where a penalty's energy vanishes
+SHRINKING = (0.3, 0.85)  # ratios of successive steps between which their sum is foretold
 SETTLED = 0.03  # a round that changes no precision by more than this fraction ends the search
 FLOOR = 1e-3  # slip precisions below this share of the data's no longer matter
 NOISE_FLOOR = 1e-4  # of the data's root mean square: exact data would send the precision to infinity
@@ -61,6 +64,11 @@ class Choice:
     shared: tuple[float, ...] | None = None
 
     @property
+    def start(self) -> "Start":
+        """From where a search on other knots may go on."""
+        return Start(self.noise, self.curvature, self.no_slip, self.divergence, self.robust)
+
+    @property
     def deviation(self) -> torch.Tensor:
         """(C,) m/s: ``noise`` with what neighbouring samples' errors have in common."""
         return torch.tensor(self.noise, dtype=torch.float64) * torch.tensor(self.shared or 1.0, dtype=torch.float64)
@@ -75,6 +83,17 @@ class Choice:
         stronger = {name: value and less * value for name, value in vars(self).items() if name in RATIOS}
         curvature = self.curvature * less ** (1.0 / self.order)
         return replace(self, curvature=curvature, shared=tuple(shared.tolist()), **stronger)
+
+
+@dataclass(frozen=True)
+class Start:
+    """A first guess of a search; lengths in m, as in the Smoother's options."""
+
+    noise: float | Sequence[float]  # m/s, of all components or of each
+    curvature: float
+    no_slip: float | None
+    divergence: float | None
+    robust: torch.Tensor | None = None  # (n,) factors on the squared rows of the samples; None: all 1
 
 
 @dataclass(frozen=True)
@@ -186,19 +205,24 @@ class LikelihoodSearch:
         self.sharpest = (NOISE_FLOOR * speed) ** -2
         self.longest = LONGEST * max(h * n for h, n in zip(knots.spacing, knots.cells, strict=True))
 
-    def run(
-        self, noise: float, curvature: float, no_slip: float | None, divergence: float | None, rounds: int
-    ) -> Choice:
-        """Search from a first guess: noise in m/s, the others as in the Smoother's options."""
-        fit = torch.full((self.components,), noise**-2, dtype=torch.float64)
+    def run(self, start: "Start", rounds: int) -> Choice:
+        """Search from a first guess, for at most so many rounds."""
+        if start.robust is not None:
+            self._weigh(start.robust)
+        fit = torch.as_tensor(start.noise, dtype=torch.float64).expand(self.components) ** -2
         scale = self.scale(fit)
-        slip = 0.0 if self.slip is None or no_slip is None else scale * no_slip**2
-        free = 0.0 if self.divergence is None or divergence is None else scale * divergence**2
-        found, settled, count = Precisions(fit, self.roughness(scale, curvature), slip, free), False, 0
+        slip = 0.0 if self.slip is None or start.no_slip is None else scale * start.no_slip**2
+        free = 0.0 if self.divergence is None or start.divergence is None else scale * start.divergence**2
+        found, settled, count = Precisions(fit, self.roughness(scale, start.curvature), slip, free), False, 0
+        steps: list[float] = []
         while count < rounds and not settled:
             count += 1
             old, found = found, self._round(found)
             settled = self._settled(old, found)
+            steps.append(log(found.rough / old.rough))
+            ahead = 0.0 if settled else _still_to_come(steps)
+            if ahead:
+                found, steps = found._replace(rough=found.rough * exp(ahead)), []
         scale = self.scale(found.fit)
         noise_each = tuple((found.fit**-0.5).tolist())
         no_slip, divergence = ((each / scale) ** 0.5 if each > 0 else None for each in (found.slip, found.divergence))
@@ -209,20 +233,34 @@ class LikelihoodSearch:
         band, right = self.prior(now)
         posterior = Factor(band + widen(self.data.band, now.fit), self.ordering)
         prior = Factor(band, self.ordering)
-        x = posterior.solve(right + now.fit * self.data.right)
-        new_fit, scale = self._noise(x, now.fit, posterior), self.scale(now.fit)
+        penalties = self._penalty_probes(now)
+        # all right-hand sides at once: each alone would fetch the whole factor from memory
+        known = (right + now.fit * self.data.right)[:, :, None]
+        x, freed, *after = _solved(posterior, [known, self.data_probes, *penalties])
+        x, before = x.squeeze(-1), _solved(prior, penalties)
+        gained = [old - new for old, new in zip(before, after, strict=True)]
+        new_fit, scale = self._noise(x, now.fit, freed), self.scale(now.fit)
         low, high = (self.roughness(scale, factor * self.step) for factor in (SHARPEST, 1 / SHARPEST))
-        rough = now.rough * self._step(prior, posterior, self.rough_probes, self.curvature.energy(x))
+        rough = now.rough * self._step(penalties.pop(0), gained.pop(0), self.curvature.energy(x))
         rough, slip, free = min(max(rough, low), high), now.slip, now.divergence
         if self.slip is not None and slip > 0:
-            slip *= self._step(prior, posterior, self.slip_probes, self.slip.energy(x))
+            slip *= self._step(penalties.pop(0), gained.pop(0), self.slip.energy(x))
             slip = min(slip, scale / SHARPEST**2)
         if self.divergence is not None and free > 0:
-            free *= self._step(prior, posterior, self.divergence_probes, self.divergence.energy(x))
+            free *= self._step(penalties.pop(0), gained.pop(0), self.divergence.energy(x))
             free = min(free, scale * self.longest**2)
         if self.robust is not None:
             self.reweigh(x)
         return Precisions(new_fit, rough, slip, free)
+
+    def _penalty_probes(self, now: Precisions) -> list[torch.Tensor]:
+        """Random sums (active, C, PROBES) of the rows of curvature, slip and divergence that are looked for."""
+        probes = [self.rough_probes]
+        if self.slip is not None and now.slip > 0:
+            probes.append(self.slip_probes)
+        if self.divergence is not None and now.divergence > 0:
+            probes.append(self.divergence_probes)
+        return probes
 
     def prior(self, now: Precisions) -> tuple[torch.Tensor, torch.Tensor]:
         """Band and right-hand side of all penalties."""
@@ -238,10 +276,13 @@ class LikelihoodSearch:
         prior[:, 0] += SHIFT * prior[:, 0].max()
         return prior, right
 
-    def _noise(self, x: torch.Tensor, fit: torch.Tensor, posterior: Factor) -> torch.Tensor:
-        """(C,) new precisions of the samples: what they determine over how far the fit stays from them."""
+    def _noise(self, x: torch.Tensor, fit: torch.Tensor, solved: torch.Tensor) -> torch.Tensor:
+        """(C,) new precisions of the samples: what they determine over how far the fit stays from them.
+
+        ``solved``: the posterior's solutions for the data's probes.
+        """
         # tr(A^-1 S_k): how much of component k's data the posterior leaves free
-        freed = (self.data_probes * posterior.solve(self.data_probes)).sum(dim=(0, 2)) / PROBES
+        freed = (self.data_probes * solved).sum(dim=(0, 2)) / PROBES
         off = x - self.unpenalised
         misfit = (off * self.data.times(off)).sum(dim=0)
         precision = (self.rank - fit * freed).clamp(min=1.0) / misfit.clamp(min=1e-300)
@@ -251,9 +292,8 @@ class LikelihoodSearch:
         return precision.clamp(min=float(precision.max()) / UNLIKE**2)
 
     @staticmethod
-    def _step(prior: Factor, posterior: Factor, probes: torch.Tensor, energy: float) -> float:
+    def _step(probes: torch.Tensor, gained: torch.Tensor, energy: float) -> float:
         """Factor on a penalty's precision: (tr(P^-1 G) - tr(A^-1 G)) over its energy, over-relaxed."""
-        gained = prior.solve(probes) - posterior.solve(probes)
         trace = float((probes * gained).sum()) / PROBES
         return min((max(trace, 1e-30) / max(energy, 1e-30)) ** RELAXATION, MOST_PER_ROUND)
 
@@ -286,9 +326,28 @@ class LikelihoodSearch:
         self.rank = len(probe) - ridge * float((probe * ridged.solve(probe)).sum()) / PROBES
         self.data_probes = ridged.spread(self.signs).view(len(probe), self.components, PROBES)
 
+    @property
+    def unknowns(self) -> int:
+        """Of one of its systems."""
+        return self.components * len(self.ordering.nodes)
+
     def _settled(self, old: Precisions, new: Precisions) -> bool:
         fit = float(((new.fit - old.fit) / old.fit).abs().max())
         rough = abs(new.rough / old.rough - 1.0)
         slip = abs(new.slip - old.slip) / (old.slip + FLOOR * self.scale(old.fit))
         free = abs(new.divergence - old.divergence) / (old.divergence + 1e-300)
         return max(fit, rough, slip, free) < SETTLED
+
+
+def _still_to_come(steps: list[float]) -> float:
+    """What steps that shrink by the same ratio will add up to from here on; 0 where the last two do not shrink so.
+
+    Aitken's extrapolation; the smoothness creeps towards its end for many rounds by two thirds of the step before.
+    """
+    ratio = steps[-1] / steps[-2] if len(steps) > 1 and steps[-2] else 0.0
+    return steps[-1] * ratio / (1.0 - ratio) if SHRINKING[0] < ratio < SHRINKING[1] else 0.0
+
+
+def _solved(factor: Factor, right: list[torch.Tensor]) -> list[torch.Tensor]:
+    """Solutions for several right-hand sides (active, C, k), by one pass over the factor."""
+    return list(factor.solve(torch.cat(right, dim=-1)).split([each.shape[-1] for each in right], dim=-1))

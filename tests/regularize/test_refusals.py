@@ -78,7 +78,10 @@ REFUSED: dict[str, tuple[Callable[[], object], str]] = {
         "direction must be finite",
     ),
     "weights of a divergence": (lambda: DivergenceRows(KNOTS, POINTS, 3, ONES[:5, 0]), r"must be \(40,\)"),
-    "points of a divergence": (lambda: DivergenceRows(KNOTS, POINTS[:, 0], 3, ONES[:, 0]), r"expected \(n, 3\)"),
+    "points of a divergence": (
+        lambda: DivergenceRows(KNOTS, POINTS[:, 0], 3, ONES[:, 0]),
+        r"DivergenceRows: points must be of the shape \(n, A\)",
+    ),
     "knots of text": (
         lambda: Knots(("0", 0.0, 0.0), (0.005,) * 3, (2, 2, 2)),
         "origin must be a sequence, each a number, got",
@@ -106,8 +109,14 @@ REFUSED: dict[str, tuple[Callable[[], object], str]] = {
     "short right": (lambda: FACTOR.solve(RIGHT[:5]), r"the right-hand side has the shape \(5, 3\)"),
 }
 MORE: dict[str, tuple[Callable[[], object], str]] = {
-    "place": (lambda: basis(torch.tensor([math.nan]), 3), "basis: t must be finite and within 1e.06 of 0"),
-    "far place": (lambda: basis(torch.tensor([1e30]), 3), "basis: t must be finite and within 1e.06 of 0"),
+    "place": (
+        lambda: basis(torch.tensor([math.nan]), 3),
+        "basis: t must be floating point, finite and within 1e.06 of 0",
+    ),
+    "far place": (
+        lambda: basis(torch.tensor([1e30]), 3),
+        "basis: t must be floating point, finite and within 1e.06 of 0",
+    ),
     "number of nothing": (
         lambda: LinearData(POINTS, VALUES, torch.zeros(40).long(), torch.tensor([math.nan]), torch.ones(1)),
         "LinearData: value must be finite, of the shape .n., got a tensor",

@@ -21,6 +21,7 @@ DEBUG = "TORCHSPH_TRACEBACK"
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code (argparse itself leaves with 2 by `SystemExit`)."""
     args: argparse.Namespace | None = None
+    _wait_passively()
     try:
         # here, so that an interruption of the long imports is one as well
         from .program import parsed
@@ -40,6 +41,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except BaseException as fault:
         return _failed(fault, args)
     return int(code)
+
+
+def _wait_passively() -> None:
+    """Let threads that wait for others sleep, where nobody has said otherwise and torch is not loaded yet.
+
+    By default they spin, at the end of each of thousands of small parallel regions; on a machine that is shared they
+    then wait for threads which the system has taken away, and keep these from coming back.
+    """
+    if "torch" not in sys.modules:
+        os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 
 def _failed(fault: BaseException, args: argparse.Namespace | None) -> int:

@@ -15,8 +15,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeAlias
 
-from geometry.arguments import checked
-
 if TYPE_CHECKING:
     from torch import Tensor
 
@@ -43,14 +41,12 @@ class SmoothingKernel:
     normalisation: dict[int, float]
     source: str
 
-    @checked
     def value(self, distance: Tensor, smoothing_length: Tensor | float, dimension: int) -> Tensor:
         """W(r, h) in 1 / length^D; ``distance`` of any shape, same unit as ``smoothing_length``."""
         q = distance / smoothing_length
         inside = (q < self.support).to(distance.dtype)
         return self._sigma(dimension) / smoothing_length**dimension * self.shape(q) * inside
 
-    @checked
     def gradient_factor(self, distance: Tensor, smoothing_length: Tensor | float, dimension: int) -> Tensor:
         """F = (dW/dr) / r in 1 / length^(D+2); never positive; grad_a W_ab = F * (x_a - x_b)."""
         q = distance / smoothing_length
@@ -182,11 +178,10 @@ def viscosity_laplacian(distance: Tensor, smoothing_length: Tensor | float) -> T
     return 45.0 / (math.pi * smoothing_length**6) * gap
 
 
-@checked
 def kernel(name: str | SmoothingKernel) -> SmoothingKernel:
     """The kernel called ``name``; a ValueError lists the known names."""
     if isinstance(name, SmoothingKernel):
         return name
-    if name not in KERNELS:
-        raise ValueError(f"unknown smoothing kernel '{name}'; known: {', '.join(sorted(KERNELS))}")
+    if not isinstance(name, str) or name not in KERNELS:
+        raise ValueError(f"unknown smoothing kernel {name!r:.60}; known: {', '.join(sorted(KERNELS))}")
     return KERNELS[name]

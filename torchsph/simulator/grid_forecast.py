@@ -12,11 +12,11 @@ import geometry
 from geometry.arguments import checked
 from torchsph.pairs.moving_least_squares import Fetched
 
-from .schemes.option_fields import check_numbers
 from .simulator import Simulation, Simulator
 from .transfer.checks import check_grid
 
 
+@checked
 @dataclass(frozen=True)
 class Transfer:
     """How a grid forecast is put together from the particles.
@@ -33,7 +33,6 @@ class Transfer:
     projections: int = 2
 
     def __post_init__(self) -> None:
-        check_numbers(self)
         if self.fade is not None and not self.fade > 0:
             raise ValueError(f"Transfer.fade must be positive (s) or None, got {self.fade}")
         if self.projections < 0:

@@ -13,8 +13,6 @@ import geometry
 from geometry.arguments import checked
 from geometry.recordings.opening_flux import MOST_REGIONS
 
-from .schemes.option_fields import check_numbers
-
 # s: beyond every time of a recording
 _FOREVER = 1e12
 # m^3/s: a measured flux is never exact, however it is stated
@@ -32,7 +30,6 @@ class Fluid:
     viscosity: float = 0.004
 
     def __post_init__(self) -> None:
-        check_numbers(self)
         if not 0 < self.density < math.inf:
             raise ValueError(f"Fluid.density must be positive and finite (kg/m^3), got {self.density}")
         if not 0 <= self.viscosity < math.inf:
@@ -80,7 +77,6 @@ class Valve:
     leak: float | None = None
 
     def __post_init__(self) -> None:
-        check_numbers(self)
         if self.region != int(self.region) or not 1 <= self.region <= MOST_REGIONS:
             raise ValueError(
                 f"Valve.region must be a whole number from 1 (0 labels the wall) to {MOST_REGIONS}, got {self.region}"

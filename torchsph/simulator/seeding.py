@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from geometry.arguments import checked
 from torchsph.pairs.interface import Backend, RateTerms, Support
 from torchsph.pairs.smoothing_kernels import kernel
 
 from .domain import Domain
-from .schemes.option_fields import check_numbers
 from .schemes.wall_models import PotentialWall
 from .schemes.weakly_compressible import WeaklyCompressible
 from .state.neighbour_list import PairSearch
@@ -30,6 +30,7 @@ _CUT = 0.1
 _CLEARANCE = 0.2
 
 
+@checked
 @dataclass(frozen=True)
 class Seeding:
     """How particles are placed.
@@ -51,7 +52,6 @@ class Seeding:
     jitter: float = 0.02
 
     def __post_init__(self) -> None:
-        check_numbers(self)
         if self.kind not in ("boltzmann", "quiet"):
             raise ValueError(f"Seeding.kind must be 'boltzmann' or 'quiet', got '{self.kind}'")
         if not self.temperature > 0 or min(self.relaxations, self.packings) < 0 or not 0 <= self.jitter < 0.5:

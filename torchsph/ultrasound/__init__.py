@@ -6,9 +6,10 @@ recording.
 """
 
 from .acquisition import Acquisition, Beams, IQPhase, Packet
-from .beamforming.channel_data import ChannelData, read_channel_data
+from .beamforming.channel_data import ChannelData, convex_array
 from .beamforming.delay_and_sum import DelayAndSum, delay_and_sum
 from .beamforming.demodulation import demodulated
+from .beamforming.read_channel_data import read_channel_data, read_transmissions
 from .estimation.clutter import ClutterFilter, FIRFilter, PolynomialFilter, SVDFilter
 from .estimation.doppler import ColourDoppler, DopplerEstimates, colour_doppler, vector_doppler
 from .estimation.estimates import Estimates, Flag
@@ -64,6 +65,7 @@ __all__ = [
     "baseband",
     "calibrate",
     "colour_doppler",
+    "convex_array",
     "delay_and_sum",
     "demodulated",
     "fit_calibration",
@@ -74,6 +76,7 @@ __all__ = [
     "random_scene",
     "random_swirl",
     "read_channel_data",
+    "read_transmissions",
     "read_uff",
     "read_uff_recording",
     "simulate_packet",

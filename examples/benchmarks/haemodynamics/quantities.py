@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import sys
 import time
 from pathlib import Path
@@ -247,12 +248,12 @@ def show(result: dict[str, Any]) -> None:
     """Print everything, one row a line."""
     for table, rows in result.items():
         if not isinstance(rows, dict):
-            print(f"{table}: {rows:.3g}")
+            print(f"{table}: {rows if isinstance(rows, str) else format(rows, '.3g')}")
             continue
         print(table)
         for name, row in rows.items():
             if isinstance(row, dict):
-                row = "  ".join(f"{source} {value:.3f}" for source, value in row.items())
+                row = "  ".join(f"{source} {math.nan if v is None else v:.3f}" for source, v in row.items())
             elif isinstance(row, list):
                 row = "  ".join(f"{value:.3f}" for value in row)
             print(f"  {name:24s}{row if isinstance(row, str) else format(row, '.3f')}")

@@ -28,13 +28,14 @@ import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import fields, is_dataclass, replace
+from fractions import Fraction
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from limited_child import in_child
+from limited_child import in_child, in_children
 
 import geometry
 import regularize as reg
@@ -72,11 +73,27 @@ def wrong(value: object) -> Iterator[tuple[str, object]]:
         yield from ((f"{how} tensor", torch.from_numpy(array)) for how, array in arrays(value.numpy()) if plain(array))
         yield from (("meta", value.to("meta")), ("numpy", value.numpy()), ("list", value.tolist()), ("None", None))
         yield "sparse", value.to_sparse() if value.ndim else None
+        yield from (
+            ("one of it", value.reshape(-1)[:1].squeeze()),
+            ("every other", value.reshape(*value.shape, 1).repeat_interleave(2, -1)[..., 0]),
+        )
+        if value.is_floating_point():
+            yield "with gradient", value.clone().requires_grad_()
     elif isinstance(value, np.ndarray):
         yield from arrays(value)
         yield from (("list", value.tolist()), ("None", None), ("text", "text"))
+        yield from (("backwards", value[::-1]), ("masked", np.ma.masked_array(value, mask=value == value.flat[0])))
+        yield from (("bytes swapped", value.astype(value.dtype.newbyteorder())), ("tensor", torch.from_numpy(value)))
     elif isinstance(value, bool | int | float):
         yield from NUMBERS.items()
+        yield from (("of numpy", np.asarray(value)[()]), ("array of none", np.asarray(value)), ("complex", value + 0j))
+        yield from (("tensor of none", torch.tensor(value)), ("meta", torch.tensor(value, device="meta")))
+        yield from (
+            ("10**400", 10**400),
+            ("fraction", Fraction(value)),
+            ("bytes", b"1"),
+            ("float32", np.float32(value)),
+        )
     elif isinstance(value, tuple) and value and all(isinstance(one, int | float) for one in value):
         yield from (("empty", ()), ("shorter", value[:-1]), ("longer", (*value, value[-1])), ("None", None))
         yield from ((f"{how} first", (number, *value[1:])) for how, number in NUMBERS.items())
@@ -178,7 +195,7 @@ def main() -> None:
 
     parser = argparse.ArgumentParser(description=str(__doc__).splitlines()[0])
     parser.add_argument("--seconds", type=float, default=1200.0, help="time budget")
-    parser.add_argument("--only", default="", metavar="WORD", help="calls with this in their name")
+    parser.add_argument("--only", default="", metavar="WORD,...", help="calls with one of these in their name")
     parser.add_argument("--part", type=float, default=1.0, help="part of the abuses that is made, drawn at random")
     parser.add_argument("--seed", type=int, default=0, help="of that draw")
     parser.add_argument("--out", type=Path, help="every abuse with its outcome, JSON")
@@ -188,25 +205,25 @@ def main() -> None:
     out = args.out and args.out.resolve()
     with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):  # text in the place of a path is one
         for name, (function, sound) in calls(Path(folder)).items():
-            if args.only not in name:
+            if not any(word in name for word in args.only.split(",")):
                 continue
             if time.perf_counter() - began > args.seconds:
                 break
             kind, same = in_child(partial(outcome, partial(function, **sound)), HANG)
             assert kind == "read", (name, kind, same)
-            for argument, value in sound.items():
-                for how, other in wrong(value):
-                    if time.perf_counter() - began > args.seconds:
-                        break
-                    if draw.random() > args.part:
-                        continue
-                    given = sound | {argument: other}
-                    kind, text = in_child(partial(outcome, partial(function, **given)), HANG)
-                    if kind == "read":
-                        kind = "same" if text == same else "accepted"
-                    rows.append({"call": name, "argument": argument, "wrong": how, "ended": kind, "said": text[:400]})
-                    if kind in HARM:
-                        print(name, argument, how, kind, text[:240], sep=" | ", flush=True)
+            given = [
+                (argument, how, sound | {argument: other})
+                for argument, value in sound.items()
+                for how, other in wrong(value)
+                if draw.random() <= args.part
+            ]
+            answers = in_children([partial(outcome, partial(function, **one)) for _, _, one in given], HANG)
+            for (argument, how, _), (kind, text) in zip(given, answers, strict=True):
+                if kind == "read":
+                    kind = "same" if text == same else "accepted"
+                rows.append({"call": name, "argument": argument, "wrong": how, "ended": kind, "said": text[:400]})
+                if kind in HARM:
+                    print(name, argument, how, kind, text[:240], sep=" | ", flush=True)
     if out:
         out.write_text(json.dumps(rows, indent=1), encoding="utf-8")
     print(f"{len(rows)} abuses in {time.perf_counter() - began:.0f} s")

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import IO
 
@@ -48,10 +49,10 @@ def element(path: Path, name: str, shape: tuple[int, ...]) -> Streamed:
                 first = found[1] if packed else stream.tell()
             return Streamed(
                 path,
-                (lambda: _unpacked(path, start)) if packed else (lambda: path.open("rb")),
+                partial(_unpacked, path, start) if packed else partial(_plain, path),
                 first,
                 shape,
-                np.dtype(found[2]).newbyteorder(order),
+                np.dtype(order + found[2]),
                 order="F",
                 stored=size,
                 packed=packed,
@@ -73,6 +74,10 @@ def _elements(path: Path) -> Iterator[tuple[int, int, bool, str]]:
             if kind in (MATRIX, COMPRESSED):
                 yield at + 8, min(size, end - at - 8), kind == COMPRESSED, order
             at += 8 + size + (-size % 8 if kind != COMPRESSED else 0)
+
+
+def _plain(path: Path) -> IO[bytes]:
+    return path.open("rb")
 
 
 def _unpacked(path: Path, start: int) -> IO[bytes]:

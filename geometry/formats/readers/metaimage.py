@@ -114,7 +114,8 @@ def _header(path: Path) -> tuple[dict[str, str], int]:
     """What the text at the head of a file says, keys in lower case, and where it ends: after `ElementDataFile`."""
     with path.open("rb") as file:
         head = file.read(HEADER)
-    said, at = {}, 0
+    said: dict[str, str] = {}
+    at = 0
     while True:
         end = head.find(b"\n", at)
         line = head[at : end if end >= 0 else len(head)].decode("latin-1")

@@ -95,7 +95,7 @@ def _gunzipped(path: Path, start: int) -> IO[bytes]:
     file = path.open("rb")
     file.seek(start)
     stream = gzip.GzipFile(fileobj=file, mode="rb")
-    stream.myfileobj = file  # is closed with it
+    stream.myfileobj = file  # type: ignore[assignment]  # is closed with it
     return cast(IO[bytes], stream)
 
 
@@ -124,9 +124,11 @@ def open_nrrd(path: Path) -> Source:
     world = SPACES.get(str(header.get("space", "")).lower(), "")
     if header.get("space") and not world and not str(header["space"]).endswith("dimensional"):
         world = _space(str(header["space"]), path)
+    units = header.get("sample units") or header.get("units of values")
     return Source(
         str(path),
         {name: image},
+        {name: {"units": str(units).strip('" ')} if units else {}},
         axes={name: axes},
         affine=_affine(header, axes, path),
         length=_length(header, bool(world)),

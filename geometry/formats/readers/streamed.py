@@ -95,7 +95,7 @@ class Streamed:
         if self._stream is None:
             self._stream = self._opened()
         values = np.empty(shape, self.dtype, self.order)  # type: ignore[call-overload]
-        flat = memoryview(values.reshape(-1, order=self.order).view(np.uint8))  # type: ignore[call-overload]
+        flat = memoryview(values.reshape(-1, order=self.order).view(np.uint8))
         try:
             self._stream.seek(begin)
             done = 0

@@ -29,7 +29,7 @@ class Slabs:
         from vtkmodules.util.numpy_support import vtk_to_numpy
 
         begin, end, _ = index[0].indices(self.shape[0]) if index != (...,) else (0, self.shape[0], 1)
-        low, (nz, ny, nx) = self._first, self.shape[:3]
+        low, (ny, nx) = self._first, self.shape[1:3]
         selection = self._reader.GetPointDataArraySelection()
         selection.DisableAllArrays()
         selection.EnableArray(self._name)

@@ -33,7 +33,7 @@ def open_xarray(path: Path) -> Source:
     affine = _affine([places[letter].values for letter in space], str(path)) if len(space) >= 2 else None
     return Source(
         str(path),
-        variables,
+        {name: Stored(one) for name, one in variables.items()},
         {name: {key: one.attrs[key] for key in ("units",) if key in one.attrs} for name, one in variables.items()},
         {name: word for name, word in axes.items() if "?" not in word},
         affine,
@@ -42,6 +42,18 @@ def open_xarray(path: Path) -> Source:
         roles=_roles(variables),
         close=dataset.close,
     )
+
+
+class Stored:
+    """A variable with the pieces that it is stored in, where it is."""
+
+    def __init__(self, variable: xarray.Variable) -> None:
+        self._variable = variable
+        self.shape, self.dtype = variable.shape, variable.dtype
+        self.chunks = variable.encoding.get("chunks") or variable.encoding.get("chunksizes")
+
+    def __getitem__(self, index: tuple) -> np.ndarray:
+        return self._variable[index].values
 
 
 def _letter(dim: str, dataset: xarray.Dataset) -> str:

@@ -19,7 +19,7 @@ from geometry.formats.series import read_fields
 from geometry.formats.source import Source
 
 MISSING = "the extra `formats` is not installed"
-FRAMES, NODES = 24, 24
+FRAMES, NODES = 40, 24
 GRID = Grid((0.0, 0.0, 0.0), (2e-3, 2e-3, 2e-3), (NODES,) * 3)
 PLACED = {"spacing": GRID.spacing, "origin": GRID.origin, "length_unit": "m"}
 UVW = FieldMap(velocity=("u", "v", "w"), mask="mask", time="t", axes="xyzt", **PLACED)
@@ -107,7 +107,8 @@ def _zarr(recording: Recording, folder: Path) -> list[Path]:
     pytest.importorskip("zarr", reason=MISSING)
     pytest.importorskip("xarray", reason=MISSING)
     dataset = to_xarray(recording)[["velocity", "mask"]]
-    dataset.drop_vars("component").to_zarr(folder / "v.zarr")
+    pieces = {name: {"chunks": (1, *dataset[name].shape[1:])} for name in ("velocity", "mask")}
+    dataset.drop_vars("component").to_zarr(folder / "v.zarr", encoding=pieces, consolidated=False)
     return [folder / "v.zarr"]
 
 

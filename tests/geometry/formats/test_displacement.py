@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 
@@ -226,3 +227,19 @@ def test_the_command_line_moves_a_wall(tmp_path: Path, ball: Surface) -> None:
     line = f"convert {tmp_path}/wall.ply --length-unit mm --grid-spacing 0.005 --period 0.4 --motion {tmp_path}/u.npz "
     assert torchsph([*f"{line}--motion-arrays u --motion-unit mm --out {tmp_path}/m.h5".split()]) in (0, None)
     np.testing.assert_allclose(read_recording(tmp_path / "m.h5").wall.vertices, expected(ball), atol=2e-7)
+
+
+def test_the_unit_that_an_array_states_is_taken(tmp_path: Path, ball: Surface) -> None:
+    said = FieldMap(length_unit="mm", grid_spacing=0.005, period=PERIOD)
+    values = np.stack([displaced(ball.vertices, time) for time in TIME])
+    motion = MotionOptions((str(tmp_path / "u.h5"),), FieldMap(velocity=("u",)))
+    for unit, per in (("cm", 0.1), ("m", 1e-3), ("furlong", 1.0)):
+        with h5py.File(tmp_path / "u.h5", "w") as file:
+            file["u"] = per * values
+            file["u"].attrs["units"] = unit
+        if unit == "furlong":
+            with pytest.raises(FormatError, match="u: its attribute units: 'furlong' is no unit of length"):
+                convert([tmp_path / "wall.ply"], said, wall=WallOptions(motion=motion))
+            continue
+        found = convert([tmp_path / "wall.ply"], said, wall=WallOptions(motion=motion)).recording
+        np.testing.assert_allclose(found.wall.vertices, expected(ball), atol=2e-7)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from geometry import Surface, SurfaceError, box, read_surface, write_surface
+from geometry.formats import FieldMap, convert
 
 BOX = box((0, 0, 0), (0.02, 0.02, 0.02), 0.01)
 VOLUME = 8e-6
@@ -171,3 +172,111 @@ def test_longest_holes_are_labelled_in_order(tmp_path: Path) -> None:
     wide, narrow = (surface.centroids[surface.region == label][:, 2] for label in (1, 2))
     assert np.abs(wide).max() < 1e-6 and np.abs(narrow - 0.06).max() < 1e-6
     assert set(np.unique(surface.region)) == {0, 1, 2}
+
+
+@pytest.mark.parametrize(
+    "corner",
+    ["{0}", "{0}/1", "{0}//1", "{0}/1/1", "{1}", "{1}//-1", "{1}/-1/-1"],
+    ids=["v", "v/t", "v//n", "v/t/n", "-v", "-v//-n", "-v/-t/-n"],
+)
+@pytest.mark.parametrize(
+    "heads", [[], ["o body", "g side top", "usemtl red"], ["g"]], ids=["plain", "named", "unnamed"]
+)
+def test_obj_corners_in_every_form(tmp_path: Path, corner: str, heads: list[str]) -> None:
+    lines = ["mtllib box.mtl", *_vertices(CORNERS), "vt 0 0", "vn 0 0 1", *heads]
+    for number, quad in enumerate(QUADS):
+        lines += ["s 1"] * (number == 2) + ["f " + " ".join(corner.format(k + 1, k - len(CORNERS)) for k in quad)]
+    assert _read_text(tmp_path / "box.obj", lines).volume == pytest.approx(VOLUME)
+
+
+def test_obj_polygons_of_many_corners_lines_and_weights(tmp_path: Path) -> None:
+    """A prism on a hexagon, with lines and points beside its faces, and a fourth number in each vertex."""
+    angle = np.pi / 3 * np.arange(6)
+    ring = 0.01 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    points = np.concatenate([np.c_[ring, np.zeros(6)], np.c_[ring, np.full(6, 0.02)]])
+    lines = [f"{line} 1.0" for line in _vertices(points)]
+    lines += ["l 1 2 3", "p 4", "f 6 5 4 3 2 1", "f 7 8 9 10 11 12"]
+    lines += [f"f {k + 1} {(k + 1) % 6 + 1} {(k + 1) % 6 + 7} {k + 7}" for k in range(6)]
+    assert _read_text(tmp_path / "hexagon.obj", lines).volume == pytest.approx(1.5 * np.sqrt(3) * 1e-4 * 0.02, rel=1e-9)
+
+
+def _ply(form: str, counts: str, numbers: str, lists: str) -> bytes:
+    """A box of quads whose properties have other names and types, with edges between vertices and faces."""
+    order = ">" if form == "binary_big_endian" else "<"
+    codes = {"uchar": "B", "uint8": "B", "ushort": "H", "uint": "I", "int": "i", "int32": "i", "short": "h"}
+    reals = {"float": "f", "float64": "d", "double": "d"}
+    head = f"ply\nformat {form} 1.0\nobj_info no name\nelement vertex {len(CORNERS)}\n"
+    head += "".join(f"property {numbers} {axis}\n" for axis in ("x", "y", "z"))
+    head += "element edge 2\nproperty int vertex1\nproperty int vertex2\n"
+    head += (
+        f"element face {len(QUADS)}\nproperty list {counts} {lists} {'vertex_index'}\nproperty int label\nend_header\n"
+    )
+    if form == "ascii":
+        rows = ["{:.9g} {:.9g} {:.9g}".format(*point) for point in CORNERS] + ["0 1", "1 2"]
+        rows += [f"4 {' '.join(map(str, quad))} {number}" for number, quad in enumerate(QUADS)]
+        return (head + "\r\n".join(rows) + "\r\n").encode()
+    body = b"".join(struct.pack(f"{order}3{reals[numbers]}", *point) for point in CORNERS)
+    body += struct.pack(f"{order}4i", 0, 1, 1, 2)
+    for number, quad in enumerate(QUADS):
+        body += struct.pack(f"{order}{codes[counts]}4{codes[lists]}i", 4, *quad, number)
+    return head.encode() + body
+
+
+@pytest.mark.parametrize("form", ["ascii", "binary_little_endian", "binary_big_endian"])
+@pytest.mark.parametrize(
+    ("counts", "numbers", "lists"),
+    [
+        ("uchar", "float", "uint"),
+        ("uint8", "double", "int32"),
+        ("ushort", "float64", "short"),
+        ("int", "float", "uchar"),
+    ],
+)
+def test_ply_of_every_type_of_list(tmp_path: Path, form: str, counts: str, numbers: str, lists: str) -> None:
+    (tmp_path / "box.ply").write_bytes(_ply(form, counts, numbers, lists))
+    surface = read_surface(tmp_path / "box.ply")
+    assert surface.volume == pytest.approx(VOLUME, rel=1e-6)
+    assert [surface.areas[surface.region == n].sum() for n in range(6)] == pytest.approx([4e-4] * 6)
+
+
+@pytest.mark.parametrize("form", ["ascii", "binary"])
+def test_stl_in_millimetres(tmp_path: Path, form: str) -> None:
+    mesh = BOX.trimesh()
+    mesh.vertices = 1e3 * mesh.vertices
+    mesh.export(tmp_path / "box.stl", file_type="stl" if form == "binary" else "stl_ascii")
+    assert read_surface(tmp_path / "box.stl", scale=1e-3).volume == pytest.approx(VOLUME, rel=1e-6)
+    with pytest.raises(SurfaceError, match=r"is 20 m large, so it is probably in mm"):
+        read_surface(tmp_path / "box.stl")
+
+
+@pytest.mark.parametrize("mode", ["Ascii", "Binary", "Appended"])
+@pytest.mark.parametrize("packed", [None, "ZLib", "LZ4"])
+def test_vtp_in_every_encoding(tmp_path: Path, mode: str, packed: str | None) -> None:
+    pytest.importorskip("vtkmodules", reason="the extra `formats` is not installed")
+    from vtkmodules.util.numpy_support import numpy_to_vtk
+    from vtkmodules.vtkCommonCore import vtkPoints
+    from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkPolyData
+    from vtkmodules.vtkIOLegacy import vtkPolyDataWriter
+    from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter
+
+    points, strips, mesh = vtkPoints(), vtkCellArray(), vtkPolyData()
+    points.SetData(numpy_to_vtk(CORNERS, deep=True))
+    for a, b, c, d in QUADS:  # each side as a strip of two triangles
+        strips.InsertNextCell(4, (a, b, d, c))
+    mesh.SetPoints(points)
+    mesh.SetStrips(strips)
+    writer = vtkXMLPolyDataWriter()
+    writer.SetFileName(str(tmp_path / "box.vtp"))
+    writer.SetInputData(mesh)
+    getattr(writer, f"SetDataModeTo{mode}")()
+    getattr(writer, f"SetCompressorTypeTo{packed}")()
+    writer.Write()
+    assert read_surface(tmp_path / "box.vtp").volume == pytest.approx(VOLUME, rel=1e-6)
+    legacy = vtkPolyDataWriter()
+    legacy.SetFileName(str(tmp_path / "box.vtk"))
+    legacy.SetInputData(mesh)
+    (legacy.SetFileTypeToASCII if mode == "Ascii" else legacy.SetFileTypeToBinary)()
+    legacy.Write()
+    assert read_surface(tmp_path / "box.vtk").volume == pytest.approx(VOLUME, rel=1e-6)
+    found = convert([tmp_path / "box.vtk"], FieldMap(grid_spacing=0.005)).recording
+    assert found.wall.at(0).volume == pytest.approx(VOLUME, rel=1e-6)

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import ctypes
+import os
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -68,3 +71,13 @@ def test_a_library_of_other_sources_is_refused(handle, monkeypatch):
     finally:
         monkeypatch.undo()
         library.library.cache_clear()
+
+
+def test_headers_are_written_where_no_package_can_be_imported(tmp_path):
+    """A build in isolation has neither the packages nor torch's path: `headers.py` reads its tables by their files."""
+    code = f"import runpy; print(len(runpy.run_path({headers.__file__!r})['headers']()))"
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    found = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
+    )
+    assert found.returncode == 0 and int(found.stdout) == len(headers.headers()), found.stderr

@@ -60,9 +60,14 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
     walls.add_argument("--openings", type=int, default=0, metavar="N", help="its N longest holes are orifices")
     walls.add_argument("--unite", action="store_true", help="bodies that overlap become one")
     walls.add_argument(
-        "--sheet", default="", choices=["inner", "all"], help="of a wall of finite thickness: the blood's surface, or all"
+        "--sheet",
+        default="",
+        choices=["inner", "all"],
+        help="of a wall of finite thickness: the blood's surface, or all",
     )
-    walls.add_argument("--motion", nargs="+", default=[], metavar="FILE", help="displacements that move the one surface")
+    walls.add_argument(
+        "--motion", nargs="+", default=[], metavar="FILE", help="displacements that move the one surface"
+    )
     walls.add_argument("--motion-map", metavar="MAP.toml", help="their field map; `velocity` names the displacements")
     walls.add_argument("--motion-arrays", metavar="NAME[,NAME]", help="the displacements among the arrays of the files")
     walls.add_argument("--motion-unit", default="", metavar="UNIT", help="of the displacements (that of their lengths)")
@@ -89,7 +94,12 @@ def convert(args: argparse.Namespace) -> None:
     result = convert_files(
         args.inputs, said, format=args.format, wall=wall, rho=args.rho, mu=args.mu, description=args.description
     )
-    inputs = {"inputs": [name for name in args.inputs if Path(name).is_file()], "wall": args.wall, "map": args.map, "motion": args.motion}
+    inputs = {
+        "inputs": [name for name in args.inputs if Path(name).is_file()],
+        "wall": args.wall,
+        "map": args.map,
+        "motion": args.motion,
+    }
     account = provenance(args, inputs)
     geometry.write_recording(args.out, result.recording, strict=args.strict, provenance=account)
     for note in result.notes:

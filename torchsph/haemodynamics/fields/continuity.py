@@ -81,7 +81,7 @@ class MassBalance:
             raise ValueError("MassBalance: the mask has no node, so that there is no blood")
         passing = np.isin(wall.region, list(open_regions))
         parts = _parts(grid, inside, wall)
-        volume = np.bincount(parts.owner, weights=parts.volume, minlength=len(self.nodes))
+        volume: Array = np.bincount(parts.owner, weights=parts.volume, minlength=len(self.nodes)).astype(np.float64)
         step = max(KNOTS * min(grid.spacing), (float(volume.sum()) / MOST_CELLS) ** (1 / grid.dimension))
         self._assemble(parts, volume, wall, passing, step)
 

@@ -10,7 +10,6 @@ from torch import Tensor
 from geometry.arguments import checked
 from torchsph.assimilation import Parameter
 from torchsph.simulator.grid_forecast import Transfer
-from torchsph.simulator.schemes.option_fields import check_numbers
 
 INCREMENTS = ("spline", "ensemble")
 
@@ -32,7 +31,6 @@ class Estimated:
     spread: float
 
     def __post_init__(self) -> None:
-        check_numbers(self)
         if not self.spread > 0:
             raise ValueError(f"Estimated.spread of {self.parameter.name} must be positive, got {self.spread}")
 
@@ -89,7 +87,6 @@ class EnsembleOptions:
     estimated: tuple[Estimated, ...] = ()
 
     def __post_init__(self) -> None:
-        check_numbers(self)
         for name in ("length", "localisation", "choose_every", "batch", "lag", "minimum_members"):
             if getattr(self, name) is not None and not getattr(self, name) > 0:
                 raise ValueError(f"EnsembleOptions.{name} must be positive, got {getattr(self, name)}")

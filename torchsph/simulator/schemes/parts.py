@@ -6,8 +6,6 @@ from dataclasses import dataclass
 
 from geometry.arguments import checked
 
-from .option_fields import check_numbers
-
 
 @checked
 @dataclass(frozen=True)
@@ -25,7 +23,6 @@ class XSPH:
     form: str = "pairs"
 
     def __post_init__(self) -> None:
-        check_numbers(self)
         if not 0 < self.epsilon <= 1:
             raise ValueError(f"XSPH epsilon must lie in (0, 1], got {self.epsilon}")
         if self.level not in ("velocity", "position"):
@@ -54,7 +51,6 @@ class GammaRamp:
     keep: str = "prefactor"
 
     def __post_init__(self) -> None:
-        check_numbers(self)
         if not self.start > 0 or not self.duration > 0:
             raise ValueError(f"GammaRamp needs positive start and duration (s), got {self.start}, {self.duration}")
         if self.keep not in ("prefactor", "sound_speed"):
@@ -79,7 +75,6 @@ class Rollback:
     density: tuple[float, float] = (0.5, 2.0)
 
     def __post_init__(self) -> None:
-        check_numbers(self)
         if self.tries < 1 or self.every < 1:
             raise ValueError(f"Rollback needs at least one try and one step, got {self.tries}, {self.every}")
         if not 0 <= self.density[0] < 1 < self.density[1]:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from .option_fields import check_numbers
+from geometry.arguments import checked
 
 
+@checked
 @dataclass(frozen=True)
 class PopulationControl:
     """When particles are merged and seeded.
@@ -25,7 +26,6 @@ class PopulationControl:
     missing: float | None = 0.75
 
     def __post_init__(self) -> None:
-        check_numbers(self)
         if self.every < 1:
             raise ValueError(f"PopulationControl.every must be at least 1 step, got {self.every}")
         if self.closest is not None and not 0 < self.closest < 1:

@@ -5,15 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import ClassVar
 
+from geometry.arguments import checked
 from torchsph.pairs.smoothing_kernels import kernel
 
-from .option_fields import check_numbers
 from .population_control import PopulationControl
 from .scheme import Scheme
 from .valve_models import Reservoir, ValveOptions
 from .wall_models import CompleteKernelWall, WallModel
 
 
+@checked
 @dataclass(frozen=True)
 class Projection(Scheme):
     """Incompressible SPH by pressure projection (Cummins & Rudman 1999); None switches a term off.
@@ -65,7 +66,6 @@ class Projection(Scheme):
     population: PopulationControl | None = None
 
     def __post_init__(self) -> None:
-        check_numbers(self)
         kernel(self.kernel)
         for name in ("smoothing_ratio", "courant", "tolerance"):
             if not getattr(self, name) > 0:

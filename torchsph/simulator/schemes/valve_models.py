@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar, Protocol
 
-from .option_fields import check_numbers
+from geometry.arguments import checked
 
 
 class ValveOptions(Protocol):
@@ -16,6 +16,7 @@ class ValveOptions(Protocol):
         """Whether the model needs a fluid with an equation of state."""
 
 
+@checked
 @dataclass(frozen=True)
 class PressureSource:
     """A timed pressure source at an open valve, softened inside ``core`` (Grønli 2017, eqs. 3.3 and 3.4).
@@ -28,11 +29,11 @@ class PressureSource:
     needs_compressible: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
-        check_numbers(self)
         if not self.core > 0:
             raise ValueError(f"PressureSource.core must be positive, got {self.core}")
 
 
+@checked
 @dataclass(frozen=True)
 class Reservoir:
     """An open valve as an opening with a buffer of particles behind it whose flux follows from dV/dt.
@@ -52,7 +53,6 @@ class Reservoir:
     needs_compressible: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
-        check_numbers(self)
         if self.profile not in ("field", "flat"):
             raise ValueError(f"Reservoir.profile must be 'field' or 'flat', got '{self.profile}'")
         if self.run_out != 0 and not self.run_out > 1:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar, Protocol
 
-from .option_fields import check_numbers
+from geometry.arguments import checked
 
 
 class WallModel(Protocol):
@@ -36,6 +36,7 @@ class WallModel(Protocol):
         """Whether the wall acts through the speed of sound, which an incompressible scheme does not have."""
 
 
+@checked
 @dataclass(frozen=True)
 class PotentialWall:
     """Potential U(s) = stiffness c^2 s^2 / 2 with s = 1 - d / reach for d < reach (Grønli 2017, eqs. 3.1 and 3.2).
@@ -57,7 +58,6 @@ class PotentialWall:
     needs_compressible: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
-        check_numbers(self)
         if not self.stiffness > 0 or not self.reach > 0:
             raise ValueError(f"PotentialWall needs positive stiffness and reach, got {self.stiffness}, {self.reach}")
         if self.relaxation is not None and not self.relaxation > 0:
@@ -69,6 +69,7 @@ class PotentialWall:
         return self.relaxation is not None
 
 
+@checked
 @dataclass(frozen=True)
 class CompleteKernelWall:
     """Wall by the analytic kernel integrals behind it (Ferrand et al. 2013): no wall particles, one look-up each.
@@ -89,6 +90,5 @@ class CompleteKernelWall:
     needs_compressible: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
-        check_numbers(self)
         if not 0 <= self.gap < 0.5:
             raise ValueError(f"CompleteKernelWall.gap must lie in [0, 0.5), got {self.gap}")

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import ClassVar
 
+from geometry.arguments import checked
 from torchsph.pairs.interface import CONTINUITY_FORMS, PRESSURE_FORMS
 from torchsph.pairs.smoothing_kernels import kernel
 
-from .option_fields import check_numbers
 from .parts import XSPH, GammaRamp, Rollback
 from .population_control import PopulationControl
 from .scheme import Scheme
@@ -18,6 +18,7 @@ from .wall_models import CompleteKernelWall, WallModel
 ORDERS = ("thesis", "symplectic", "verlet", "predictor_corrector")
 
 
+@checked
 @dataclass(frozen=True)
 class WeaklyCompressible(Scheme):
     """Weakly compressible SPH with an equation of state; None switches a term off.
@@ -98,7 +99,6 @@ class WeaklyCompressible(Scheme):
     gamma_ramp: GammaRamp | None = None
 
     def __post_init__(self) -> None:
-        check_numbers(self)
         kernel(self.kernel)
         for name in ("smoothing_ratio", "sound_speed", "gamma", "courant"):
             if not getattr(self, name) > 0:

@@ -156,9 +156,9 @@ def check_values(particles: Particles, openings: int = 0) -> None:
         )
     if bool((p.mass <= 0).any()):
         raise ValueError(f"the particles' mass must be positive, but is {float(p.mass.min()):g} at the least")
-    least, most = (float(value) for value in torch.aminmax(p.mass))
-    if most > MOST_RATIO * least:
-        raise ValueError(f"the particles' mass runs from {least:g} to {most:g}: particles of one run are alike")
+    lightest, heaviest = (float(value) for value in torch.aminmax(p.mass))
+    if heaviest > MOST_RATIO * lightest:
+        raise ValueError(f"the particles' mass runs from {lightest:g} to {heaviest:g}: particles of one run are alike")
     if bool((p.deviation <= -1).any()):
         raise ValueError(
             "the particles' deviation, (rho - rho0) / rho0, must be above -1 (no density at all), but is "

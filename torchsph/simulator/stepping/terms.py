@@ -54,8 +54,7 @@ def step_limits(
     """
     h = smoothing_length
     acoustic = courant * h / (sound_speed + speed).clamp_min(torch.finfo(speed.dtype).tiny)
-    known = isinstance(viscosity, Tensor)
-    nu = viscosity.to(speed).expand_as(speed) if known else torch.full_like(speed, viscosity)
+    nu = viscosity.to(speed).expand_as(speed) if isinstance(viscosity, Tensor) else torch.full_like(speed, viscosity)
     viscous = courant * h * h / (8.0 * nu).clamp_min(torch.finfo(speed.dtype).tiny)
     force = courant * torch.sqrt(0.5 * h / acceleration.clamp_min(torch.finfo(speed.dtype).tiny))
     return torch.stack([acoustic.expand_as(speed), viscous, force])

@@ -27,17 +27,24 @@ class KernelCompleteness:
         kernel: of the pair sums.
         smoothing_length: h.
         dtype: of the transforms; float32 leaves 1e-6 of the completeness.
+        device: where the distances are.
     """
 
     def __init__(
-        self, shape: tuple[int, ...], step: float, kernel: SmoothingKernel, smoothing_length: float, dtype: torch.dtype
+        self,
+        shape: tuple[int, ...],
+        step: float,
+        kernel: SmoothingKernel,
+        smoothing_length: float,
+        dtype: torch.dtype,
+        device: str | torch.device = "cpu",
     ) -> None:
         self.shape, self.step, self.dtype = tuple(shape), step, dtype
         filters = _filters(len(shape), step, kernel, smoothing_length)
         self._reach = filters.shape[1] // 2
         self._axes = tuple(range(1, len(shape) + 1))
         self._size = tuple(next_fast_len(n + 2 * self._reach, real=True) for n in shape)
-        self._transforms = torch.fft.rfftn(filters.to(dtype), s=self._size, dim=self._axes)
+        self._transforms = torch.fft.rfftn(filters.to(device=device, dtype=dtype), s=self._size, dim=self._axes)
 
     def at(self, distance: Tensor) -> tuple[Tensor, Tensor]:
         """Completeness (1, *shape) in [0, 1] and its gradient (D, *shape), components x, y, z.

@@ -75,7 +75,9 @@ class WallFields:
         self.complete, self.sliding = complete, sliding
         self._completeness: KernelCompleteness | None = None
         if complete:
-            self._completeness = KernelCompleteness(self.grid.shape, _FIELD_SPACING, kernel, smoothing_length, dtype)
+            self._completeness = KernelCompleteness(
+                self.grid.shape, _FIELD_SPACING, kernel, smoothing_length, dtype, device
+            )
         self._openings = orifices(motion)
         self._made: OrderedDict[tuple[int, tuple[int, ...]], Tensor] = OrderedDict()
         self._cavity: OrderedDict[float, np.ndarray] = OrderedDict()
@@ -110,14 +112,16 @@ class WallFields:
     def _make(self, number: int, open_regions: tuple[int, ...]) -> Tensor:
         time = self.key_times.times[number]
         distance, velocity = self._distance(self.motion.surface(time), time, open_regions)
-        d = torch.from_numpy(distance / self.spacing).to(self.dtype).reshape(self.grid.shape)
+        # to the device first: the transforms are most of what is left to do
+        d = torch.from_numpy(distance / self.spacing).to(self.dtype).reshape(self.grid.shape).to(self.device)
         carried = torch.from_numpy(velocity.T / self.speed).to(self.dtype).reshape(-1, *self.grid.shape)
+        carried = carried.to(self.device)
         channels = [d[None], _normals(d), carried]
         if self._completeness is not None:
             channels.extend(self._completeness.at(d))
             if self.sliding:
                 channels.append(self._completeness.swept(d, (carried * channels[1]).sum(0), channels[1]))
-        return by_node(torch.cat(channels).to(self.device))
+        return by_node(torch.cat(channels))
 
     def _distance(self, surface: Surface, time: float, open_regions: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
         """Distance (n,) from the closed part of the wall, positive in blood and open channels; velocity (n, D).

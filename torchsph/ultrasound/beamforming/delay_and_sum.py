@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -24,7 +25,8 @@ class DelayAndSum:
 
     Args:
         f_number: depth over the width of the receiving aperture; 0 = all elements.
-        beams: of the packet; ``None`` = parallel along the last axis, as for waves that leave straight.
+        beams: of the packet; ``None`` = parallel along the last axis, as for waves that leave straight, and from the
+            middle of the circle for a convex array.
         phase: convention of the packet.
     """
 
@@ -37,32 +39,56 @@ class DelayAndSum:
             raise ValueError(f"f_number must be finite and >= 0, got {self.f_number!r}")
 
 
-def delay_and_sum(data: ChannelData, grid: Grid, options: DelayAndSum | None = None) -> Packet:
-    """IQ images of the transmissions of a wave.
+def delay_and_sum(data: ChannelData | Sequence[ChannelData], grid: Grid, options: DelayAndSum | None = None) -> Packet:
+    """IQ images of the transmissions of a wave, or of several that are compounded coherently.
 
     A pixel p is the sum over the elements of IQ(t) exp(2 pi i f t) at the time t of the way to p and back, between
     samples linear. The wave is at p when the first of the elements' own waves is: that holds for plane and diverging
-    waves, not behind a focus.
+    waves, not behind a focus. Of several waves an image is the mean of theirs, before any envelope is taken (Montaldo
+    et al. 2009); what moves between them is not made up for.
 
     Args:
-        data: RF (which is demodulated first) or IQ.
+        data: RF (which is demodulated first) or IQ, of one wave or of each.
         grid: of the image, in the elements' coordinates.
         options: aperture, beams and phase.
 
     Raises:
-        ValueError: where grid and elements differ in dimension, or RF cannot be demodulated.
+        ValueError: where grid and elements differ in dimension, waves in their images, or RF cannot be demodulated.
     """
     options = options or DelayAndSum()
+    waves = [data] if isinstance(data, ChannelData) else list(data)
+    if not waves:
+        raise ValueError("data: there is no wave")
+    for wave in waves[1:]:
+        if wave.acquisition != waves[0].acquisition or len(wave.signals) != len(waves[0].signals):
+            raise ValueError("data: waves that are compounded must have one acquisition and as many images each")
+    iq = sum((_images(wave, grid, options.f_number) for wave in waves[1:]), _images(waves[0], grid, options.f_number))
+    beams = options.beams or _beams(waves[0], grid.dimension)
+    packet = Packet(iq / len(waves), grid, waves[0].acquisition, beams, phase=IQPhase.CARRIER)
+    return baseband(packet) if options.phase is IQPhase.BASEBAND else packet
+
+
+def _beams(data: ChannelData, dimension: int) -> Beams:
+    """Parallel along the last axis, or from where the normals of a curved array meet."""
+    straight = (0.0,) * (dimension - 1) + (1.0,)
+    if data.normals is None or bool((data.normals - data.normals[0]).abs().max() < 1e-9):
+        return Beams(straight)
+    normals = data.normals.double()
+    across = torch.eye(dimension, dtype=torch.float64) - normals[:, :, None] * normals[:, None, :]
+    right = (across @ data.elements.double()[:, :, None]).sum(0)
+    apex = torch.linalg.solve(across.sum(0), right)[:, 0]  # least distance from all lines
+    return Beams(straight, tuple(apex.tolist()))
+
+
+def _images(data: ChannelData, grid: Grid, f_number: float) -> Tensor:
+    """Images (T, *shape) of a wave, with the carrier."""
     if data.elements.shape[1] != grid.dimension:
         raise ValueError(f"elements are {data.elements.shape[1]}-D, the grid {grid.dimension}-D")
     data = demodulated(data)
     pixels, images = grid.nodes().double(), len(data.signals)
     samples = data.signals.permute(2, 1, 0).reshape(-1, images)  # element by element, so that a pixel reads rows
-    tiles = [_summed(data, samples, tile.to(samples.device), options.f_number) for tile in pixels.split(TILE)]
-    iq = torch.cat(tiles).T.reshape(images, *grid.shape).contiguous()
-    beams = options.beams or Beams((0.0,) * (grid.dimension - 1) + (1.0,))
-    packet = Packet(iq, grid, data.acquisition, beams, phase=IQPhase.CARRIER)
-    return baseband(packet) if options.phase is IQPhase.BASEBAND else packet
+    tiles = [_summed(data, samples, tile.to(samples.device), f_number) for tile in pixels.split(TILE)]
+    return torch.cat(tiles).T.reshape(images, *grid.shape).contiguous()
 
 
 def _summed(data: ChannelData, samples: Tensor, pixels: Tensor, f_number: float) -> Tensor:
@@ -84,7 +110,8 @@ def _summed(data: ChannelData, samples: Tensor, pixels: Tensor, f_number: float)
     before = place.floor().clamp(0, count - 2)
     used = (place >= 0) & (place <= count - 2)
     if f_number > 0:
-        used &= offset[..., :-1].norm(dim=2) <= offset[..., -1] / (2 * f_number)
+        ahead, aside = _seen(data, offset, back)
+        used &= aside <= ahead / (2 * f_number)
     turn = 2 * math.pi * data.acquisition.frequency * time
     carrier = torch.polar(used.to(turn), turn)
     row = before.long() + torch.arange(len(elements), device=pixels.device) * count
@@ -94,6 +121,20 @@ def _summed(data: ChannelData, samples: Tensor, pixels: Tensor, f_number: float)
         rows = samples[row + step]
         total += torch.einsum("pe,pet->pt", (weight * carrier).to(rows), rows)
     return total
+
+
+def _seen(data: ChannelData, offset: Tensor, back: Tensor) -> tuple[Tensor, Tensor]:
+    """How far pixels lie ahead of the elements and beside their axes, (P, elements) each, m.
+
+    Args:
+        data: with its normals.
+        offset: (P, elements, D), m, from the elements.
+        back: (P, elements), m, its length.
+    """
+    if data.normals is None:
+        return offset[..., -1], offset[..., :-1].norm(dim=2)
+    ahead = (offset * data.normals.to(offset)).sum(-1)
+    return ahead, (back.square() - ahead.square()).clamp_min(0).sqrt()
 
 
 def _arrival(back: Tensor, delays: Tensor, sound_speed: float, *, in_a_row: bool) -> Tensor:

@@ -142,7 +142,7 @@ def test_a_run_that_goes_on_from_particles_keeps_the_split():
         ({"flux": 1e-5, "pressure": 100.0}, "give its flux or its pressure, not both"),
         ({"flux": ((0.0, 0.0), (1.0, 2.0))}, "times must increase"),
         ({"flux": ((0.0, 1.0), (1.0,))}, "of one length"),
-        ({"flux": ((0.0, 1.0), (1.0, math.nan))}, "be finite"),
+        ({"flux": ((0.0, 1.0), (1.0, math.nan))}, "flux must be without NaN"),
     ],
 )
 def test_a_flux_that_cannot_be_is_refused(fields, rule):

@@ -144,7 +144,7 @@ def test_pressures_that_cannot_be():
     scene = duct(*SCHEMES[0], (1.0, 0.0), across=8).simulator.scene
     with pytest.raises(ValueError, match=r"need Reservoir, not PressureSource"):
         Simulator(scene, preset("thesis"))
-    with pytest.raises(ValueError, match="Valve.pressure must be a number that is finite, got nan"):
+    with pytest.raises(ValueError, match="Valve: pressure must be finite, got nan"):
         duct(*SCHEMES[0], (math.nan, 0.0), across=8)
     run = duct(*SCHEMES[0], (lambda t: math.nan, 0.0), across=8)
     with pytest.raises(ValueError, match="Valve.pressure of region 1 must be finite"):

@@ -1,0 +1,78 @@
+"""The search for smoothness takes short cuts to the end that it would creep to."""
+
+from __future__ import annotations
+
+from math import isclose
+
+import pytest
+import torch
+
+import regularize
+from regularize.basis.knots import Knots
+from regularize.smoothing import search
+from regularize.statistics import likelihood
+
+
+def flow(noise=0.15, side=11):
+    """Samples (n, 3) of waves in a cube of 6 cm with noise, m/s, and the truth."""
+    generator = torch.Generator().manual_seed(3)
+    axis = (torch.arange(side, dtype=torch.float64) + 0.5) * (0.06 / side)
+    points = torch.cartesian_prod(axis, axis, axis)
+    truth = torch.stack([torch.sin(70 * points[:, 1]), torch.cos(60 * points[:, 2]), torch.sin(50 * points[:, 0])], 1)
+    return points, truth, truth + noise * torch.randn(truth.shape, generator=generator, dtype=torch.float64)
+
+
+def chosen(**options):
+    points, truth, samples = flow()
+    smoother = regularize.Smoother(spacing=(0.06 / 11,) * 3, wall=None, no_slip=None, correlated=False, **options)
+    field = smoother.fit(points, samples, divergence_points=points)
+    return field.choice, float((field(points) - truth).norm() / truth.norm())
+
+
+def test_coarser_knots_first_and_foretold_steps_lead_to_the_same_choice(monkeypatch):
+    found, error = chosen()
+    with monkeypatch.context() as patch:
+        patch.setattr(search, "WORTH_COARSER", float("inf"))
+        patch.setattr(likelihood, "_still_to_come", lambda steps: 0.0)
+        patch.setattr(likelihood, "SETTLED", 1e-4)
+        crept, least = chosen(rounds=100)
+    assert crept.settled and found.settled
+    assert found.noise == pytest.approx(crept.noise, rel=0.02)
+    assert found.curvature == pytest.approx(crept.curvature, rel=0.03)
+    assert error == pytest.approx(least, rel=2e-3)
+
+
+def test_the_short_cuts_are_shorter(monkeypatch):
+    rounds = []
+    before = likelihood.LikelihoodSearch._round
+
+    def counted(self, now):
+        rounds.append(self.unknowns)
+        return before(self, now)
+
+    monkeypatch.setattr(likelihood.LikelihoodSearch, "_round", counted)
+    chosen()
+    most, short = max(rounds), len([size for size in rounds if size == max(rounds)])
+    rounds.clear()
+    with monkeypatch.context() as patch:
+        patch.setattr(search, "WORTH_COARSER", float("inf"))
+        patch.setattr(likelihood, "_still_to_come", lambda steps: 0.0)
+        chosen()
+    assert set(rounds) == {most} and short < len(rounds)
+
+
+def test_steps_that_shrink_by_the_same_ratio_are_summed():
+    steps = [0.2 * 0.6**k for k in range(60)]
+    assert isclose(likelihood._still_to_come(steps[:4]), sum(steps[4:]), rel_tol=1e-9)
+    for others in ([0.2], [0.2, 0.19], [0.2, -0.1], [0.0, 0.1], [0.1, 0.2]):
+        assert likelihood._still_to_come(others) == 0.0
+
+
+def test_knots_that_are_spread_out_cover_the_same_box():
+    knots = Knots((0.0, 0.1), (0.01, 0.02), (7, 5))
+    wide = knots.spread_out(1.5)
+    assert wide.spacing == pytest.approx((0.015, 0.03))
+    for axis in range(2):
+        low, high = knots.origin[axis], knots.origin[axis] + 0.01 * (axis + 1) * knots.cells[axis]
+        assert wide.origin[axis] <= low + 1e-12
+        assert wide.origin[axis] + wide.spacing[axis] * wide.cells[axis] >= high - 1e-12
