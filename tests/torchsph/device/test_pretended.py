@@ -35,6 +35,7 @@ WAITS = {
     "torchsph/simulator/state/clock.py": (2.2, "the time at which planes of openings are placed, on the processor"),
     "torchsph/simulator/stepping/pressure.py": (2, "whether walls move and the solver has converged"),
     "torchsph/simulator/valves/cavity_volume.py": (2, "tables of volume and its rate"),
+    "torchsph/simulator/valves/free_channel.py": (2, "which way the flow goes through an opening"),
     "torchsph/simulator/valves/plane_groups.py": (2, "whether members see the same planes of openings"),
     "torchsph/simulator/valves/reservoirs.py": (5, "who has crossed an opening, rows of the buffers, what turns round"),
     "torchsph/simulator/valves/openings.py": (1, "particles near the rim"),
