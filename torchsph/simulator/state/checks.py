@@ -158,7 +158,7 @@ def check_values(particles: Particles, openings: int = 0) -> None:
         raise ValueError(f"the particles' mass must be positive, but is {float(p.mass.min()):g} at the least")
     lightest, heaviest = (float(value) for value in torch.aminmax(p.mass))
     if heaviest > MOST_RATIO * lightest:
-        raise ValueError(f"the particles' mass runs from {lightest:g} to {heaviest:g}: particles of one run are alike")
+        raise ValueError(f"the particles' mass runs from {lightest:g} to {heaviest:g}: those of one run are alike")
     if bool((p.deviation <= -1).any()):
         raise ValueError(
             "the particles' deviation, (rho - rho0) / rho0, must be above -1 (no density at all), but is "
