@@ -169,9 +169,9 @@ def test_open_files_are_closed_or_reported(tmp_path: Path) -> None:
 def test_files_that_hold_no_surface_are_named(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match="nowhere.stl"):
         read_surface(tmp_path / "nowhere.stl")
-    (tmp_path / "mesh.vtk").write_text("x")
-    with pytest.raises(SurfaceError, match="mesh.vtk: surfaces are read from .stl, .obj, .ply, .vtp, not"):
-        read_surface(tmp_path / "mesh.vtk")
+    (tmp_path / "mesh.msh").write_text("x")
+    with pytest.raises(SurfaceError, match="mesh.msh: surfaces are read from .stl, .obj, .ply, .vtp, .vtk, not"):
+        read_surface(tmp_path / "mesh.msh")
     for name in ("bad.ply", "bad.stl", "bad.obj"):
         (tmp_path / name).write_text("nothing of the kind")
         with pytest.raises(SurfaceError, match=name):
