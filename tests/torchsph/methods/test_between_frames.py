@@ -56,6 +56,10 @@ class WrongModel:
         return SimpleNamespace(value=value[None], covered=mask[None])
 
 
+# whose forecasts the tests replace
+ANY_MODEL = torchsph.Simulator(torchsph.Scene(1e-3, period=(0.01, 0.01, 0.01)))
+
+
 @pytest.fixture
 def with_model(monkeypatch):
     """Makes `BetweenFrames` of a recording with a model that is wrong in a known way."""
@@ -65,7 +69,7 @@ def with_model(monkeypatch):
             return WrongModel(flow, grid, time, error)
 
         monkeypatch.setattr(between_frames, "GridForecast", forecast)
-        return BetweenFrames(recording, SimpleNamespace(device="cpu"))
+        return BetweenFrames(recording, ANY_MODEL)
 
     return make
 
@@ -135,7 +139,7 @@ def test_a_model_that_fails_leaves_straight_lines_and_says_so(box_recording, mon
 
     monkeypatch.setattr(between_frames, "GridForecast", broken)
     recording, points = box_recording(straight), inner_points()
-    flow = BetweenFrames(recording, SimpleNamespace(device="cpu"))
+    flow = BetweenFrames(recording, ANY_MODEL)
     with pytest.warns(RuntimeWarning, match="linear in time from there to 0.01 s"):
         found = flow.at([0.005], points)
     np.testing.assert_allclose(found.velocity[0], straight(points, 0.005), atol=2e-7)

@@ -100,6 +100,6 @@ def test_recordings_of_another_dimension_than_the_simulator_s(
             call()
     with pytest.raises(ValueError, match="the truth has a grid of"):
         ts.assimilate(measured, space, members=2, truth=plane)
-    for leads in ([-0.01], [float("nan")]):
-        with pytest.raises(ValueError, match="leads must not be negative"):
+    for leads, rule in (([-0.01], "leads must not be negative"), ([float("nan")], "leads must be without NaN")):
+        with pytest.raises(ValueError, match=rule):
             ts.skill(measured, space, leads)
