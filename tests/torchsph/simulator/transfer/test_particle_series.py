@@ -73,7 +73,7 @@ def test_vtk_plays_it(tmp_path):
 
 def test_what_cannot_be_written_is_refused_before_the_run(tmp_path):
     run = vortices()
-    with pytest.raises(ValueError, match="every must be at least 1"):
+    with pytest.raises(ValueError, match="every must be from 1 to"):
         ParticleSeries(tmp_path / "a.vtkhdf", run, every=0)
     with pytest.raises(ValueError, match="member must lie in 0 to 0"):
         ParticleSeries(tmp_path / "a.vtkhdf", run, member=1)
