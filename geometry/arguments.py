@@ -261,11 +261,13 @@ def _all_finite(value: np.ndarray | torch.Tensor) -> bool:
 
 
 @overload
-def checked(subject: Subject, /) -> Subject: ...
+def checked(subject: Subject, /) -> Subject:
+    """Without rules."""
 
 
 @overload
-def checked(**rules: Rule) -> Callable[[Subject], Subject]: ...
+def checked(**rules: Rule) -> Callable[[Subject], Subject]:
+    """With rules."""
 
 
 def checked(subject: Subject | None = None, /, **rules: Rule) -> Subject | Callable[[Subject], Subject]:

@@ -211,8 +211,7 @@ class AdvancingRun:
         """
         before, old = self.particles, self._acceleration
         inner, ends = step.to(before.position.dtype), self.time + (done + step) * self.units.time
-        number = self.record.steps.clone()
-        plan = Step(self._stepper, self.surroundings, self.record, inner, ends, number)
+        plan = Step(self._stepper, self.surroundings, self.record, inner, ends, self.record.steps)
         after, acceleration, stepped, wall = plan.take(before)
         if any_waiting:
             waiting = step == 0

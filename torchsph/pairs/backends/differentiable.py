@@ -204,7 +204,7 @@ class DifferentiableBackend(Backend[BothPairs]):
         if not _derived(given):
             return Moments(*some(self._fast, given))
         return Moments(
-            *_Pass.apply(lambda arrays: some(self._fast, arrays), lambda arrays: some(_PLAIN, arrays), *given)
+            *TakenTwice.apply(lambda arrays: some(self._fast, arrays), lambda arrays: some(_PLAIN, arrays), *given)
         )
 
     def _taken(
@@ -225,7 +225,7 @@ class DifferentiableBackend(Backend[BothPairs]):
             found = some(_PLAIN, pairs.plain, given.with_arrays(some_arrays))
             return tuple(value for value in found if value is not None)
 
-        values = iter(_Pass.apply(by_fast, by_plain, *arrays))
+        values = iter(TakenTwice.apply(by_fast, by_plain, *arrays))
         return tuple(next(values) if there else None for there in present)
 
 
@@ -272,8 +272,11 @@ class _Inputs:
         return self.with_arrays([value.detach() for value in self.arrays()])
 
 
-class _Pass(torch.autograd.Function):
-    """Values by one function of arrays, first derivatives by another that torch can differentiate."""
+class TakenTwice(torch.autograd.Function):
+    """Values by one function of arrays, first derivatives by another that torch differentiates when they are needed.
+
+    Nothing but the arrays is kept from one to the other.
+    """
 
     @staticmethod
     def forward(ctx: Any, fast: Evaluate, plain: Evaluate, *arrays: Tensor) -> Arrays:

@@ -6,12 +6,15 @@ through it (checkpointing: Griewank & Walther 2000, sec. 2). The second time it 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, fields, replace
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
+
+from torchsph.pairs.backends.differentiable import TakenTwice
 
 from ..state.clock import Clock
 from ..state.particles import Particles
@@ -79,20 +82,20 @@ class Step:
         later = self._apart()
         seen: list[Taken] = []
 
-        def forwards(values: tuple[Tensor, ...]) -> dict[str, Tensor]:
+        def forwards(values: Sequence[Tensor]) -> tuple[Tensor, ...]:
             step, start = self._with(particles, dict(zip(inputs, values, strict=True)), self)
             taken = step._plainly(start)
             self.surroundings.at(self.ends)
             seen.append(taken)
-            return _arrays(taken.particles)
+            return tuple(_arrays(taken.particles).values())
 
-        def once_more(values: tuple[Tensor, ...]) -> dict[str, Tensor]:
+        def once_more(values: Sequence[Tensor]) -> tuple[Tensor, ...]:
             step, start = self._with(particles, dict(zip(inputs, values, strict=True)), later._apart())
-            return _arrays(step._plainly(start).particles)
+            return tuple(_arrays(step._plainly(start).particles).values())
 
-        names: list[str] = []
-        outputs = _Replayed.apply(forwards, once_more, names, *inputs.values())
+        outputs = TakenTwice.apply(forwards, once_more, *inputs.values())
         (taken,) = seen
+        names = _arrays(taken.particles)
         return taken._replace(particles=taken.particles.changed(**dict(zip(names, outputs, strict=True))))
 
     def _inputs(self, particles: Particles) -> dict[str, Tensor]:
@@ -112,7 +115,8 @@ class Step:
         around = copy(self.surroundings)
         around.clock = copy(around.clock)
         stepper = self.stepper.apart(self.stepper.coefficients, record)
-        return replace(self, stepper=stepper, surroundings=around, record=record)
+        # the account counts on in place
+        return replace(self, stepper=stepper, surroundings=around, record=record, number=self.number.clone())
 
     @staticmethod
     def _with(particles: Particles, values: dict[str, Tensor], step: Step) -> tuple[Step, Particles]:
@@ -141,37 +145,3 @@ def _give(clock: Clock, values: dict[str, Any], split: dict[str, Any]) -> None:
         setattr(clock, name, value)
     if split and clock.flux_split is not None:
         clock.flux_split = replace(clock.flux_split, **split)  # type: ignore[type-var]
-
-
-class _Replayed(torch.autograd.Function):
-    """Values by one function without a tape, derivatives by another that torch differentiates when they are needed."""
-
-    @staticmethod
-    def forward(ctx: Any, forwards: Any, once_more: Any, names: list[str], *values: Tensor) -> tuple[Tensor, ...]:
-        """See ``torch.autograd.Function``."""
-        ctx.once_more = once_more
-        ctx.save_for_backward(*values)
-        found = forwards(tuple(value.detach() for value in values))
-        names.extend(found)
-        ctx.names = list(found)
-        return tuple(found.values())
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, *given: Tensor | None) -> tuple[Tensor | None, ...]:
-        """See ``torch.autograd.Function``."""
-        wanted = ctx.needs_input_grad[3:]
-        with torch.enable_grad():
-            values = [
-                value.detach().requires_grad_(need) for value, need in zip(ctx.saved_tensors, wanted, strict=True)
-            ]
-            found = ctx.once_more(tuple(values))
-            some = [
-                (found[name], g)
-                for name, g in zip(ctx.names, given, strict=True)
-                if g is not None and found[name].requires_grad
-            ]
-            leaves = [value for value, need in zip(values, wanted, strict=True) if need]
-            grads = torch.autograd.grad([v for v, _ in some], leaves, [g for _, g in some], allow_unused=True)
-        answers = iter(grads)
-        return (None, None, None, *(next(answers) if need else None for need in wanted))
