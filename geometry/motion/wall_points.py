@@ -62,7 +62,10 @@ class WallSampler:
         count, faces = int(group.max()) + 1, len(surface.faces)
         share = 1 / np.bincount(owner)[owner]
         area = share * surface.areas[owner]
-        mean = (area / np.bincount(group, weights=area)[group])[:, None] * weights
+        whole = np.bincount(group, weights=area)[group]
+        # faces without an area, from vertices that coincide, have a middle all the same
+        part = np.where(whole > 0, area / np.where(whole > 0, whole, 1.0), 1 / np.bincount(group)[group])
+        mean = part[:, None] * weights
         rows = np.repeat(group, surface.dimension)
         # Points and velocities are means over vertices, area vectors sums over faces: linear maps, made once.
         self._mean = _sparse(mean, rows, surface.faces[owner], (count, len(surface.vertices)))

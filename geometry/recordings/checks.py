@@ -67,8 +67,9 @@ def _lengths(recording: Recording) -> Iterator[Finding]:
     grid = recording.grid
     sizes = {"/grid": max(b - a for a, b in zip(grid.origin, grid.upper, strict=True))}
     if recording.wall is not None:
-        lower, upper = recording.wall.at(0).bounds
-        sizes["/wall/vertices"] = float((upper - lower).max())
+        first, vertices = recording.wall.at(0).bounds, recording.wall.vertices
+        later = vertices.max(axis=1) - vertices.min(axis=1)  # every frame: a single one may be in another unit
+        sizes["/wall/vertices"] = max(float((first[1] - first[0]).max()), float(later.max()))
     for dataset, size in sizes.items():
         if size > LARGEST:
             unit, scale = ("mm", 1e-3) if size > 10 * LARGEST else ("mm or cm", 1e-3)

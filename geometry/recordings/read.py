@@ -263,7 +263,7 @@ def _numbers(node: h5py.Group | h5py.Dataset | h5py.Datatype, dataset: str, sour
         raise RecordingError(source, dataset, f"must be a dataset, not {kind}")
     if node.external is not None or node.is_virtual:
         raise RecordingError(source, dataset, f"keeps its data {ELSEWHERE}")
-    if node.dtype.kind not in "fiub":
+    if node.dtype.kind not in "fiub" or (node.dtype.kind == "b" and dataset in QUANTITIES):
         raise RecordingError(source, dataset, f"must be numbers, not {brief(node.dtype)}")
     if node.shape is None:
         raise RecordingError(source, dataset, "is an empty dataset without a shape; leave it out")
