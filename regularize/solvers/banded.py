@@ -4,6 +4,8 @@ import numpy as np
 import torch
 from scipy.linalg.blas import dsbmv
 
+from .blas_threads import one_thread
+
 ROWS = 256  # copied at a time
 
 
@@ -39,5 +41,6 @@ def widen(scalar: torch.Tensor, scale: torch.Tensor) -> torch.Tensor:
 def multiply(band: torch.Tensor, x: torch.Tensor) -> torch.Tensor:
     """Symmetric band matrix times x (n, k)."""
     a = band.numpy().T  # Fortran order, as LAPACK wants it
-    columns = [dsbmv(len(a) - 1, 1.0, a, column, lower=1) for column in x.T.contiguous().numpy()]
+    with one_thread():
+        columns = [dsbmv(len(a) - 1, 1.0, a, column, lower=1) for column in x.T.contiguous().numpy()]
     return torch.from_numpy(np.stack(columns, axis=1))

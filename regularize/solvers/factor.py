@@ -12,6 +12,7 @@ from regularize.rows.ordering import Ordering
 
 from . import cholesky
 from .banded import dense_block
+from .blas_threads import one_thread
 
 
 class Factor:
@@ -53,7 +54,8 @@ class Factor:
     def spread(self, white: torch.Tensor) -> torch.Tensor:
         """The factor times white (unknowns, k): draws whose covariance is the factored matrix."""
         band = self.band.numpy().T  # LAPACK's layout
-        columns = [dtbmv(len(band) - 1, band, z, lower=1) for z in white.T.contiguous().numpy()]
+        with one_thread():
+            columns = [dtbmv(len(band) - 1, band, z, lower=1) for z in white.T.contiguous().numpy()]
         return torch.from_numpy(np.stack(columns, axis=1))
 
     def sample(self, precision: float, generator: torch.Generator) -> torch.Tensor:

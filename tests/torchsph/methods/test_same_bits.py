@@ -1,13 +1,18 @@
 """The same seed gives the same bits for any number of threads, again and again, beside a busy process too."""
 
 import multiprocessing
+import os
+import subprocess
+import sys
 from contextlib import contextmanager
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
 import geometry
+import regularize
 from torchsph import PreparedMeasurement, Scene, Simulator, assimilate, filter_sph, preset
 from torchsph.data import sample_measurement
 
@@ -66,3 +71,24 @@ def test_every_method_has_the_same_bits_with_any_number_of_threads(scheme):
     for other in found[1:]:
         for mine, first in zip(other, found[0], strict=True):
             np.testing.assert_array_equal(mine, first)
+
+
+FIT = """
+import hashlib, torch, regularize
+draw = torch.Generator().manual_seed(0)
+points = 0.02 * torch.rand(300, 3, generator=draw, dtype=torch.float64)
+values = torch.randn(300, 3, generator=draw, dtype=torch.float64)
+smoother = regularize.Smoother(knots=2.0, spacing=(5e-3,) * 3, divergence=0.02, curvature=3e-3)
+print(hashlib.sha256(smoother.fit(points, values).coefficients.numpy().tobytes()).hexdigest())
+"""
+
+
+def test_splines_have_the_same_bits_whatever_threads_a_process_starts_with(tmp_path):
+    """SciPy's BLAS reads OMP_NUM_THREADS when it is loaded, and its sums depended on it."""
+    root = str(Path(regularize.__file__).parents[1])
+    found = set()
+    for number in ("1", "2"):
+        environment = {**os.environ, "OMP_NUM_THREADS": number, "OPENBLAS_NUM_THREADS": number, "PYTHONPATH": root}
+        call = [sys.executable, "-W", "ignore", "-c", FIT]
+        found.add(subprocess.run(call, cwd=tmp_path, env=environment, check=True, capture_output=True).stdout)
+    assert len(found) == 1
