@@ -217,7 +217,7 @@ def splines() -> dict[str, Call]:
         ),
         "Smoother": (
             lambda **given: reg.Smoother(**given).fit(points, values, weight).coefficients,
-            {"knots": 2.0, "spacing": (5e-3,) * 3, "degree": 3, "divergence": 0.1, "curvature": 1e-3},
+            {"knots": 2.0, "spacing": (5e-3,) * 3, "degree": 3, "divergence": 0.02, "curvature": 3e-3},
         ),
         "Smoother.fit": (
             lambda **given: smoother.fit(**given).coefficients,
