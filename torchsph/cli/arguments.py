@@ -38,6 +38,16 @@ def add_model_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--device", default="cpu", metavar="D", help="cpu, cuda or cuda:N (%(default)s)")
 
 
+def add_workers(parser: argparse.ArgumentParser) -> None:
+    """How many processes share the work."""
+    parser.add_argument(
+        "--workers",
+        type=whole(1),
+        metavar="N",
+        help="processes of one thread each that share the work, with the same result (as many as it may use cores)",
+    )
+
+
 def add_seed(parser: argparse.ArgumentParser, metavar: str = "S") -> None:
     """The seed of everything random."""
     parser.add_argument("--seed", type=whole(0), default=0, metavar=metavar, help="of everything random (%(default)s)")

@@ -20,7 +20,7 @@ from torchsph.methods import by_name
 from torchsph.methods.runtime import checkpoint, parallel
 from torchsph.report import write_report
 
-from ..arguments import add_model_options, add_output_folder, add_seed, add_sidecar, names, whole
+from ..arguments import add_model_options, add_output_folder, add_seed, add_sidecar, add_workers, names, whole
 from ..checks import check_spacing, informative, usable_device
 from ..command import Command
 from ..outputs import output_folder, staged, write_json
@@ -62,6 +62,7 @@ def add_method_options(parser: argparse.ArgumentParser) -> None:
         "--minimum-members", type=whole(1), metavar="N", help="end the run where fewer live through a forecast (1)"
     )
     parser.add_argument("--no-page", action="store_true", help="leave out report.html")
+    add_workers(parser)
     add_seed(parser)
     add_sidecar(parser)
     parser.add_argument(
@@ -116,9 +117,11 @@ def assimilate(args: argparse.Namespace) -> None:
                 progress=lead and shows_bar(args),
                 quantities=read_out,
                 keep_members=folder / "members.h5" if args.keep_members else None,
+                workers=args.workers,
             )
         if not lead:
             return
+        account["processes"] = max(account["processes"], *(one.info.get("processes", 1) for one in results.values()))
         signals.waits = True  # what is left are seconds, and all the work is in them
         chosen = by_name.DEFAULT_METHOD if by_name.DEFAULT_METHOD in methods else methods[0]
         config = run_config(args, measured=measured_path, truth=truth_path, methods=methods, analysis=chosen)

@@ -12,7 +12,7 @@ from torchsph.evaluation import figures
 from torchsph.evaluation.frames import SAME_TIME
 from torchsph.methods import by_name
 
-from ..arguments import add_model_options, add_output_folder, add_seed, seconds, whole
+from ..arguments import add_model_options, add_output_folder, add_seed, add_workers, seconds, whole
 from ..checks import check_spacing, full_vectors, usable_device
 from ..command import Command
 from ..outputs import output_folder, staged, write_json
@@ -38,6 +38,7 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
         "--every", type=whole(1), default=1, metavar="K", help="start from each K-th frame (%(default)s)"
     )
     add_model_options(parser)
+    add_workers(parser)
     add_seed(parser)
     parser.add_argument("--save", action="store_true", help="also write the forecasts, one recording for each lead")
     add_output_folder(parser)
@@ -59,9 +60,11 @@ def forecast(args: argparse.Namespace) -> None:
         save=args.save,
         progress=shows_bar(args),
         seed=args.seed,
+        workers=args.workers,
     )
     config = run_config(args, recording=args.recording, leads=leads) | dict(skill.config)
     account = provenance(args, {"recording": args.recording})
+    account["processes"] = max(account["processes"], config.pop("processes", 1))
     config["info"] = {"provenance": account}
     with locked(folder), staged(folder) as scratch:
         for lead, saved in skill.recordings.items():
