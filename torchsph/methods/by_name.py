@@ -16,6 +16,7 @@ from torchsph.simulator.state.checks import MOST_MEMBERS, SPACING
 
 from .ensemble.options import EnsembleOptions
 from .forecast_skill import ForecastSkill, skill, starts
+from .measurement.frame_splines import CHOICE_EVERY
 from .measurement.prepared import PreparedMeasurement
 from .memory import MemoryPrediction, free_memory, predicted
 from .methods_run import METHODS, MethodResult, MethodsRun
@@ -33,6 +34,7 @@ __all__ = [
     "forecast_skill",
     "make_model",
     "make_smoother",
+    "parallel_tasks",
     "predicted_forecast_memory",
     "predicted_memory",
     "run_methods",
@@ -103,7 +105,7 @@ def run_methods(
     count = DEFAULT_MEMBERS if members is None else members
     foretold, free = predicted_memory(prepared, methods, preset, models.spacing, count, also), free_memory()
     options = EnsembleOptions(lag=lag, minimum_members=minimum_members)
-    tasks = _tasks(prepared, methods, count, options) if device == "cpu" else 1
+    tasks = parallel_tasks(measured.frames, methods, count, options.batch) if device == "cpu" else 1
     processes = chosen_workers(workers, tasks, lambda number: foretold.in_processes(number).fits(free))
     foretold.in_processes(processes).refuse_beyond(free)
     run = MethodsRun(
@@ -126,11 +128,13 @@ def run_methods(
     return spread(partial(run.results, watcher, progress), run.for_worker().results, processes)
 
 
-def _tasks(prepared: PreparedMeasurement, methods: Sequence[str], members: int, options: EnsembleOptions) -> int:
+def parallel_tasks(
+    frames: int, methods: Sequence[str], members: int = DEFAULT_MEMBERS, batch: int = EnsembleOptions.batch
+) -> int:
     """How many processes find work: on the members and the control, or on the splines where there are no members."""
     if "ensemble" in methods:
-        return 1 + -(-members // options.batch)
-    return 2 if "sph" in methods else prepared.splines.groups
+        return 1 + -(-members // batch)
+    return 2 if "sph" in methods else -(-frames // CHOICE_EVERY)
 
 
 def predicted_memory(

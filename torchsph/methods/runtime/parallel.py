@@ -41,7 +41,7 @@ class Group:
     Attributes:
         rank: of this process. processes: how many there are.
         store: which all of them write to and read from.
-        ready: returns when all processes have come.
+        ready: returns when all processes have come to their first exchange.
         local: whether all are on this machine, started by the first of them.
         rounds: lists of tasks that they have shared so far.
     """
@@ -49,7 +49,7 @@ class Group:
     rank: int
     processes: int
     store: dist.Store
-    ready: Callable[[], None] = lambda: None
+    ready: Callable[[], object] = lambda: None
     local: bool = False
     rounds: int = field(default=0, init=False)
 

@@ -21,7 +21,7 @@ import torch.distributed as dist
 from torchsph.assimilation.distributed import PeerLost
 
 from . import parallel
-from .workers import BEREFT, CALL, FAULT, HERE, PAUSE, STORE
+from .workers import BEREFT, CALL, FAULT, PAUSE, STORE, meeting
 
 
 def main(folder: Path, processes: int, rank: int) -> None:
@@ -36,8 +36,8 @@ def main(folder: Path, processes: int, rank: int) -> None:
             time.sleep(PAUSE)
         with (folder / CALL).open("rb") as file:
             call = pickle.load(file)
-        group = parallel.Group(rank, processes, dist.FileStore(str(folder / STORE), processes), local=True)
-        (folder / HERE.format(rank)).touch()
+        store = dist.FileStore(str(folder / STORE), processes)
+        group = parallel.Group(rank, processes, store, lambda: list(meeting(folder, rank, processes)), local=True)
         with parallel.within(group):
             call()
             signal.pause()  # until the lead has what it waits for, and ends this process

@@ -69,14 +69,14 @@ def spread(lead: Callable[[], T], worker: Callable[[], object], workers: int) ->
         return lead()
     if parallel.processes() > 1 or parallel.under_torchrun():
         raise ValueError("workers: the processes of this run are there already (torchrun); leave workers at 1")
-    with tempfile.TemporaryDirectory(prefix="torchsph-", ignore_cleanup_errors=True) as name, _one_thread():
+    with tempfile.TemporaryDirectory(prefix="torchsph-", ignore_cleanup_errors=True) as name, one_thread():
         folder = Path(name)
         with _Workers(folder, workers) as others:
             with (folder / "making").open("wb") as file:
                 pickle.dump(worker, file, pickle.HIGHEST_PROTOCOL)
             (folder / "making").rename(folder / CALL)
             store = dist.FileStore(str(folder / STORE), workers)
-            group = parallel.Group(0, workers, store, others.come, local=True)
+            group = parallel.Group(0, workers, store, others.met, local=True)
             try:
                 with parallel.within(group):
                     return lead()
@@ -119,8 +119,17 @@ def memory_of_workers() -> tuple[int, int]:
     return now, peak
 
 
+def meeting(folder: Path, rank: int, count: int) -> Iterator[None]:
+    """Tell the others that this process has come to the first exchange, and look, again and again, until all have."""
+    (folder / HERE.format(rank)).touch()
+    missing = [folder / HERE.format(other) for other in range(count)]
+    while missing := [path for path in missing if not path.exists()]:
+        yield
+        time.sleep(PAUSE)
+
+
 @contextmanager
-def _one_thread() -> Iterator[None]:
+def one_thread() -> Iterator[None]:
     """This process has one thread meanwhile, as its workers have."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
@@ -165,17 +174,15 @@ class _Workers:
     def __exit__(self, kind: type[BaseException] | None, fault: BaseException | None, at: TracebackType | None) -> None:
         self._end()
 
-    def come(self) -> None:
-        """Return when all workers have come.
+    def met(self) -> None:
+        """Return when this process and all workers have come to their first exchange.
 
         Raises:
             PeerLost: one of them has ended instead.
         """
-        missing = [self.folder / HERE.format(rank) for rank in range(1, self.count)]
-        while missing := [path for path in missing if not path.exists()]:
+        for _ in meeting(self.folder, 0, self.count):
             if any(process.poll() is not None for process in self.processes):
-                raise PeerLost("a worker has ended before it had begun")
-            time.sleep(PAUSE)
+                raise PeerLost("a worker has ended before its first exchange")
 
     def fault(self) -> Exception:
         """What has become of the worker that was lost: its own fault, where it could still tell it."""
