@@ -16,10 +16,11 @@ from torchsph.methods.runtime import parallel
 
 
 def task(number: int) -> tuple[int, int]:
-    """The number and the process that had it; the others than the first are slow."""
+    """The number and the process that had it; the first one is slow."""
     if parallel.is_worker():
         warnings.warn(f"task {number}", stacklevel=1)
-        time.sleep(0.05)
+    else:
+        time.sleep(0.1)
     return number, parallel.rank()
 
 
@@ -44,12 +45,12 @@ def methods(recording: geometry.Recording, measured: geometry.Recording) -> dict
 
 
 def exchanges() -> dict[str, Any]:
-    """How tasks are parted, and what processes tell one another."""
+    """What processes tell one another, and how tasks are parted once all have come."""
     return {
-        "tasks": parallel.shared([partial(task, k) for k in range(20)]),
-        "last": parallel.from_last(parallel.rank()),
         "lead": parallel.from_lead(parallel.rank()),
+        "last": parallel.from_last(parallel.rank()),
         "anywhere": (parallel.anywhere(False), parallel.anywhere(parallel.is_last())),
+        "tasks": parallel.shared([partial(task, k) for k in range(10)]),
     }
 
 
