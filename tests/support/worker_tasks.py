@@ -16,11 +16,10 @@ from torchsph.methods.runtime import parallel
 
 
 def task(number: int) -> tuple[int, int]:
-    """The number and the process that had it; the first one is slow."""
+    """The number and the process that had it."""
     if parallel.is_worker():
         warnings.warn(f"task {number}", stacklevel=1)
-    else:
-        time.sleep(0.1)
+    time.sleep(0.2)
     return number, parallel.rank()
 
 
