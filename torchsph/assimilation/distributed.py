@@ -20,8 +20,8 @@ from .errors import AssimilationError
 from .filters.base import Analysis, Filter
 from .observations import Observations, Screened
 
-# s between two looks for what other processes send: at first, and at most
-_NAP, _LONGEST_NAP = 5e-5, 5e-3
+# s between two looks for what other processes send: a share of what was waited already, at least and at most
+_NAP, _OF_THE_WAIT, _LONGEST_NAP = 5e-5, 0.02, 5e-2
 
 
 class PeerLost(RuntimeError):
@@ -34,10 +34,9 @@ def arrived(work: dist.Work) -> None:
     Raises:
         PeerLost: one of the processes has gone.
     """
-    nap = _NAP
+    began = time.monotonic()
     while not work.is_completed():
-        time.sleep(nap)
-        nap = min(2 * nap, _LONGEST_NAP)
+        time.sleep(min(max(_OF_THE_WAIT * (time.monotonic() - began), _NAP), _LONGEST_NAP))
     try:
         work.wait()
     except RuntimeError as fault:

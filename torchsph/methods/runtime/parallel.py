@@ -184,9 +184,10 @@ def advanced(bar: Bar) -> None:
 def shared(tasks: Sequence[Callable[[], T]]) -> list[T]:
     """The results of independent tasks, each done by one process and told to all.
 
-    Process k begins with task k, and who is free takes what nobody has begun, so that none waits long for another that
-    the machine holds up. No task may change what another one, or what comes after, depends on: what it changes is
-    changed in one process alone. Every process has to call this, with tasks of the same number and meaning.
+    Each process begins with a stretch of its own, because neighbours often have something in common, and who is free
+    takes what nobody has begun, so that none waits long for another that the machine holds up. No task may change what
+    another one, or what comes after, depends on: what it changes is changed in one process alone. Every process has to
+    call this, with tasks of the same number and meaning.
     """
     if processes() == 1:
         return [task() for task in tasks]
@@ -223,10 +224,15 @@ def _taken(count: int) -> Iterator[int]:
         yield from range(rank(), count, processes())
         return
     group.rounds += 1
-    for step in range(count):
-        number = (group.rank + step) % count
+    for number in _order(count, group.rank, group.processes):
         if group.store.add(f"task/{group.rounds}/{number}", 1) == 1:
             yield number
+
+
+def _order(count: int, own: int, group: int) -> list[int]:
+    """In which order a process of a group looks for tasks: its own stretch, then what the others come to last."""
+    first, end = count * own // group, count * (own + 1) // group
+    return [*range(first, end), *reversed([*range(end, count), *range(first)])]
 
 
 def shared_pair(first: Callable[[], A], second: Callable[[], B]) -> tuple[A, B]:

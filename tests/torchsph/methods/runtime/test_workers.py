@@ -23,6 +23,7 @@ from torchsph.cli import main
 from torchsph.data import sample_measurement
 from torchsph.methods.memory import MemoryPrediction
 from torchsph.methods.runtime import cores
+from torchsph.methods.runtime.parallel import _order
 from torchsph.methods.runtime.workers import KilledWorker, LostWorker, _living, chosen_workers, spread
 
 
@@ -47,6 +48,18 @@ def test_every_task_is_done_once_and_told_to_all_with_its_warnings():
     assert [number for number, _ in found["tasks"]] == list(range(10))
     assert len({rank for _, rank in found["tasks"]}) > 1  # which of them is for the machine to say
     assert (found["lead"], found["last"], found["anywhere"]) == (0, 2, (False, True))
+
+
+@pytest.mark.parametrize(("count", "group"), [(10, 3), (3, 2), (2, 5), (0, 2)])
+def test_stretches_cover_all_tasks_once_and_everybody_comes_to_all_in_the_end(count, group):
+    orders = [_order(count, own, group) for own in range(group)]
+    assert all(sorted(order) == list(range(count)) for order in orders)
+    if count == 10:
+        assert orders == [
+            [0, 1, 2, 9, 8, 7, 6, 5, 4, 3],
+            [3, 4, 5, 2, 1, 0, 9, 8, 7, 6],
+            [6, 7, 8, 9, 5, 4, 3, 2, 1, 0],
+        ]
 
 
 @pytest.mark.slow  # a minute
