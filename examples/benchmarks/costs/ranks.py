@@ -10,6 +10,7 @@ process and with two in turn, and compares the analyses bit for bit. Of the repe
     bound     what the ratio of the walls would be on cores that nobody else uses: the CPU seconds of one process over
               those of the critical path of two, where from one exchange to the next the slower one counts
     repeated  share of one process's seconds that both processes spend
+    sent      MB that the first process tells the other for a frame
 """
 
 import argparse
@@ -36,10 +37,18 @@ EXCHANGES = ("all_gather", "all_gather_object", "broadcast", "broadcast_object_l
 
 
 class Segments:
-    """CPU seconds of this process from one exchange with the others to the next."""
+    """CPU seconds of this process from one exchange with the others to the next, and the bytes that it tells them."""
 
     def __init__(self) -> None:
         self.seconds: list[float] = []
+        self.sent, packed = 0, parallel._packed
+
+        def counted(value):
+            found = packed(value)
+            self.sent += len(found)
+            return found
+
+        parallel._packed = counted
         self.began, self.inside = time.process_time(), False
         for name in EXCHANGES:
             setattr(dist, name, self._counting(getattr(dist, name)))
@@ -70,13 +79,13 @@ def work(members: int, frames: int, out: Path) -> None:
         measured = measured.select(slice(measured.frames - frames, measured.frames))
         run = pipeline.run_methods(measured, ["ensemble"], members=members)["ensemble"].recording
         segments.close()
-        wall, everyone = time.perf_counter() - began, [segments.seconds]
+        wall, everyone, sent = time.perf_counter() - began, [segments.seconds], 0
         if dist.is_initialized():
-            everyone = [None] * dist.get_world_size()
+            sent, everyone = segments.sent, [None] * dist.get_world_size()
             dist.all_gather_object(everyone, segments.seconds)
     if parallel.is_lead():
         digest = hashlib.sha256(run.velocity.tobytes() + run.sigma.tobytes()).hexdigest()
-        out.write_text(json.dumps({"wall": wall, "segments": everyone, "digest": digest}))
+        out.write_text(json.dumps({"wall": wall, "segments": everyone, "digest": digest, "sent": sent / frames}))
 
 
 def launched(processes: int, members: int, frames: int) -> dict:
@@ -116,6 +125,7 @@ def compared(members: int, frames: int, repeats: int) -> dict:
         "critical": critical,
         "bound": alone / critical,
         "repeated": spent / alone - 1.0,
+        "sent": two["sent"],
         "launch": [one["launch"], two["launch"]],
         "same_bits": same,
     }
@@ -136,7 +146,7 @@ def main() -> None:
     if args.quick:
         args.members, args.frames, args.repeats = [16], 5, 1
     rows = []
-    print("members    one s    two s    ratio   CPU of one   of two            bound  repeated  same bits")
+    print("members    one s    two s    ratio   CPU of one   of two            bound  repeated  sent  same bits")
     for members in args.members:
         row = compared(members, args.frames, args.repeats)
         rows.append(row)
@@ -145,7 +155,7 @@ def main() -> None:
         same = "yes" if row["same_bits"] else "NO"
         print(
             f"{members:7d} {one:8.1f} {two:8.1f} {row['ratio']:8.2f} {row['cpu']:12.1f}   {each:15s} "
-            f"{row['bound']:7.2f} {100 * row['repeated']:7.0f} %  {same}",
+            f"{row['bound']:7.2f} {100 * row['repeated']:7.0f} % {1e-6 * row['sent']:5.2f}  {same}",
             flush=True,
         )
     if args.json:
