@@ -141,9 +141,7 @@ def test_the_nth_step_fails_for_every_n(name: str, run: Callable[[str], int]) ->
     assert tried >= 3
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[pytest.mark.slow] if name == "assimilate" else []) for name in COMMANDS]
-)
+@pytest.mark.parametrize("name", COMMANDS)
 def test_the_disk_is_full_at_any_byte(name: str, run: Callable[[str], int]) -> None:
     assert run(name) == 0
     largest = max(len(data) for data in content().values())
@@ -155,9 +153,7 @@ def test_the_disk_is_full_at_any_byte(name: str, run: Callable[[str], int]) -> N
             assert code == 2 and content() == before, limit
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[pytest.mark.slow] if name == "assimilate" else []) for name in COMMANDS]
-)
+@pytest.mark.parametrize("name", COMMANDS)
 def test_a_folder_that_is_gone_or_may_not_be_written_to(name: str, run: Callable[[str], int]) -> None:
     Path("results").rmdir()
     if name == "assimilate":  # makes its folder; a file in its place is no folder
