@@ -20,7 +20,7 @@ from regularize.solvers.factor import Factor
 from ..runtime.parallel import shared
 from .flux_data import with_fluxes
 from .informative import refuse_exact, refuse_silent
-from .wall_rows import at_knots, mean_certainty, open_regions, wall_rows
+from .wall_rows import at_knots, faces_one_way, mean_certainty, open_regions, wall_rows
 from .wall_trust import wall_trust
 
 # noise and smoothness are chosen in every third frame and serve its neighbours: flow and noise change over tens of
@@ -217,11 +217,17 @@ class FrameSmoother:
         return fitted
 
     def _open_together(self, frame: int) -> tuple[int, ...]:
-        """Regions at a frame whose fluxes are for the data to say: several, or velocities contradict the walls."""
+        """Regions at a frame whose fluxes are for the data to say: several, or velocities contradict the walls.
+
+        Openings that face apart are several, also where they share a label.
+        """
         if self.motion is None:
             return ()
-        regions = open_regions(self.recording, float(self.recording.time[frame]))
-        return regions if len(regions) > 1 or self.estimates.contradicted else ()
+        time = float(self.recording.time[frame])
+        regions = open_regions(self.recording, time)
+        if len(regions) == 1 and not self.estimates.contradicted:
+            return () if faces_one_way(self.motion.surface(time), regions[0]) else regions
+        return regions
 
     def _trusting(self, frame: int) -> regularize.Smoother:
         """The smoother with the strength that the walls of a frame deserve: less where they are uncertain."""
