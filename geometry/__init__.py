@@ -1,6 +1,7 @@
 """Recordings, regular grids, closed surfaces and their signed distance, moving walls, ventricle shapes."""
 
 from .grids.grid import Grid, Stencil
+from .grids.unwrapping import unwrap
 from .motion.estimates import Estimates, estimated
 from .motion.moving_distance import MovingDistance, WallField, WallPoint
 from .motion.orifices import Orifice, OrificePlane, orifices
@@ -87,6 +88,7 @@ __all__ = [
     "surface_from_velocity",
     "taubin",
     "tube",
+    "unwrap",
     "wall_points",
     "winding_number",
     "with_lids",

@@ -30,6 +30,7 @@ QUANTITIES = {
     "/time": "time",
     "/velocity": "velocity",
     "/sigma": "velocity",
+    "/nyquist": "velocity",
     "/pressure": "pressure",
     "/pressure_sigma": "pressure",
     "/wall/vertices": "length",

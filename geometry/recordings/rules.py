@@ -52,6 +52,7 @@ def check_recording(recording: Recording, source: str = "recording") -> None:
         _speed,
         _sigma,
         _beam,
+        _nyquist,
         _overlap,
         _valves,
         _series,
@@ -167,6 +168,13 @@ def _beam(recording: Recording, source: str) -> None:
     if bad.any():
         rule = f"must hold unit vectors, but does not at {_first(bad)}; divide by their length"
         raise RecordingError(source, "/beam", rule)
+
+
+def _nyquist(recording: Recording, source: str) -> None:
+    limit = recording.nyquist
+    if limit is not None and not ((limit > 0) & (limit <= FASTEST)).all():
+        rule = f"is the speed at which a measurement wraps, m/s: positive and at most {FASTEST:g}, not {limit.min():g}"
+        raise RecordingError(source, "/nyquist", f"{rule}; leave it out where nothing wraps")
 
 
 def _wall(recording: Recording, source: str) -> None:
