@@ -5,6 +5,7 @@ from .grids.unwrapping import unwrap
 from .motion.estimates import Estimates, estimated
 from .motion.moving_distance import MovingDistance, WallField, WallPoint
 from .motion.orifices import Orifice, OrificePlane, orifices
+from .motion.plane_cut import plane_cut
 from .motion.refine import refined, refined_motion
 from .motion.valve_times import ValveTimes, find_valve_times
 from .motion.wall_estimate import WallEstimate, estimate_wall
@@ -74,6 +75,7 @@ __all__ = [
     "measurement_type",
     "openings",
     "orifices",
+    "plane_cut",
     "polygon",
     "read_provenance",
     "read_recording",

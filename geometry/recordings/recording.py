@@ -122,6 +122,7 @@ class Recording:
         flux_aortic: (T,), m^3/s, likewise.
         fluxes: measured fluxes of regions, with their errors.
         nyquist: (T,), or (T, D) for each component of full vectors, m/s: what was measured is known modulo twice this.
+        cut: of a plane, whether it is cut out of a flow in space, so that something passes through it.
 
     Raises:
         RecordingError: shapes that disagree; `geometry.check_recording` tests every rule of the format.
@@ -151,6 +152,7 @@ class Recording:
     flux_aortic: np.ndarray | None = None
     fluxes: tuple[OpeningFlux, ...] = ()
     nyquist: np.ndarray | None = None
+    cut: bool = False
 
     def __post_init__(self) -> None:
         _check_kinds(self)
@@ -272,7 +274,7 @@ class Recording:
 
 def _check_kinds(recording: Recording) -> None:
     """Refuse what is no grid, wall, flux, text or number in the place of one; numbers become Python's."""
-    kinds = (("grid", Grid), ("wall", Wall | None), ("description", str), ("fluxes", tuple))
+    kinds = (("grid", Grid), ("wall", Wall | None), ("description", str), ("fluxes", tuple), ("cut", bool))
     wrong = [name for name, kind in kinds if not isinstance(getattr(recording, name), kind)]
     if wrong or not all(isinstance(flux, OpeningFlux) for flux in recording.fluxes):
         name = wrong[0] if wrong else "fluxes"

@@ -44,6 +44,7 @@ def check_recording(recording: Recording, source: str = "recording") -> None:
     for rule in (
         _constants,
         _description,
+        _cut,
         _grid,
         _time,
         _weight,
@@ -88,6 +89,13 @@ def _description(recording: Recording, source: str) -> None:
     if "\0" in text or any("\ud800" <= letter <= "\udfff" for letter in text):
         rule = "must be plain text without NUL and without halves of surrogate pairs; leave out what is not text"
         raise RecordingError(source, "attribute description", rule)
+
+
+def _cut(recording: Recording, source: str) -> None:
+    if recording.cut and recording.dimension != 2:
+        raise RecordingError(
+            source, "attribute cut", "is 1, for a plane cut out of a flow in space, but this is a volume"
+        )
 
 
 def _grid(recording: Recording, source: str) -> None:
