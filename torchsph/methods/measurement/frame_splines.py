@@ -21,6 +21,7 @@ from ..runtime.parallel import advanced, shared
 from ..runtime.workers import MOST_WORKERS, chosen_workers, spread
 from .flux_data import with_fluxes
 from .informative import refuse_exact, refuse_silent
+from .unwrapping import unwrapped
 from .wall_rows import at_knots, faces_one_way, mean_certainty, open_regions, wall_rows
 from .wall_trust import wall_trust
 
@@ -59,7 +60,7 @@ class FrameSmoother:
             raise ValueError(f"choose_every must be at least 1, got {choose_every}")
         refuse_silent(recording)
         refuse_exact(recording)
-        self.estimates = geometry.estimated(recording) if estimates is None else estimates
+        self.estimates = geometry.estimated(unwrapped(recording)) if estimates is None else estimates
         recording = self.estimates.recording
         self.type = geometry.measurement_type(recording)
         if smoother.automatic and not self.type.full:

@@ -22,6 +22,7 @@ from ..schemes.valve_models import Reservoir
 from ..state.clock import Clock
 from ..state.particles import CHANNEL, FLUID, RESERVOIR, Particles
 from ..state.record import Record
+from ..transfer.exchange import exchanged
 from .accounts import note_passed
 from .buffer_flow import AREA_TRUST, mean_near, scaled_profile, volume_of_rows, with_channel_flux
 from .cavity_volume import CavityVolume
@@ -98,6 +99,14 @@ class Reservoirs(ValveModel):
         """See ``SharedFlux.points``."""
         return self._shared.points(clock)
 
+    def open_points(self, clock: Clock) -> Tensor | None:
+        """See ``SharedFlux.open_points``."""
+        return self._shared.open_points(clock)
+
+    def through_open(self, velocity: Tensor, clock: Clock) -> Tensor:
+        """See ``SharedFlux.through_open``."""
+        return self._shared.through_open(velocity, clock)
+
     def note_split(self, velocity: Tensor, clock: Clock) -> None:
         """See ``SharedFlux.read_field``."""
         self._shared.read_field(velocity, clock)
@@ -151,6 +160,8 @@ class Reservoirs(ValveModel):
         """The same for members that see the same planes."""
         times = clock.of_members(particles.members)
         inflow, active, given = self.volume.rate(times), self.openings.active(clock), self.openings.given
+        if particles.exchange is not None:
+            inflow = inflow - exchanged(particles)
         if self.relaxation is not None and not channel and not any(number in given for number, _ in active):
             inflow = inflow + self._deficit(particles, clock) / self.relaxation
             if self._setting.compressible:
