@@ -18,7 +18,7 @@ import regularize
 import torchsph as ts
 from torchsph.data import sample_measurement, sample_truth
 
-from .record import ROOT, code_hash
+from ..provenance import ROOT, code_hash
 
 Part = TypeVar("Part")
 PHANTOM, MEASUREMENTS = "lv_phantom_a.h5", {"measured": "lv_phantom_a_measured.h5", "noisy": "lv_phantom_a_noisy.h5"}

@@ -17,7 +17,7 @@ import geometry
 from torchsph.evaluation.metrics import evaluate
 from torchsph.haemodynamics.quantities import FlowDomain
 
-from ..figures.record import ROOT, provenance
+from ..provenance import ROOT, provenance
 from . import __doc__ as about
 from . import tuning
 from .registry import RIVALS, Rival

@@ -14,8 +14,9 @@ if str(ROOT) not in sys.path:
 
 from examples.figures.__main__ import draw, main
 from examples.figures.material import Material
-from examples.figures.record import bare, code_hash, is_current, stale
+from examples.figures.record import is_current
 from examples.figures.registry import FIGURES
+from examples.provenance import bare, code_hash, stale
 
 RESULTS = ROOT / "examples" / "figures" / "results"
 

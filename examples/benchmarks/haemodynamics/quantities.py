@@ -26,6 +26,7 @@ import numpy as np
 import torch
 
 import geometry
+from examples.provenance import ANALYSES, write_table
 from torchsph.evaluation.frames import matching_frames
 from torchsph.evaluation.metrics import filled_velocity
 from torchsph.haemodynamics import (
@@ -43,6 +44,8 @@ from torchsph.haemodynamics import (
 )
 from torchsph.haemodynamics.flow_rate import peaks
 from torchsph.methods.members.kept import read_members
+
+SOURCES = ("examples/benchmarks/haemodynamics/quantities.py", "torchsph/haemodynamics", *ANALYSES)
 
 Curves = dict[str, np.ndarray]
 
@@ -241,7 +244,7 @@ def main() -> None:
         result |= given.components(options.tracers)
     show(result)
     if options.json is not None:
-        options.json.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+        write_table(options.json, result, SOURCES)
 
 
 def show(result: dict[str, Any]) -> None:
