@@ -16,6 +16,7 @@ import shlex
 import subprocess
 import sys
 from collections.abc import Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -53,15 +54,27 @@ def code_hash(sources: Sequence[str], root: Path = ROOT) -> str:
     return digest.hexdigest()[:16]
 
 
+@lru_cache(maxsize=4096)
 def bare(text: str) -> str:
     """Python source without its docstrings, lines of comment and empty lines."""
     lines = text.split("\n")
-    for node in ast.walk(ast.parse(text)):
+    waiting: list[ast.AST] = [ast.parse(text)]
+    while waiting:
+        node = waiting.pop()
         body = getattr(node, "body", None)
         if isinstance(body, list) and body and isinstance(body[0], ast.Expr):
             value = body[0].value
             if isinstance(value, ast.Constant) and isinstance(value.value, str):
                 lines[value.lineno - 1 : value.end_lineno] = [""] * (value.end_lineno - value.lineno + 1)
+        for part in (
+            "body",
+            "orelse",
+            "finalbody",
+            "handlers",
+            "cases",
+        ):  # statements alone: expressions hold no docstring
+            inner = getattr(node, part, None)
+            waiting += inner if isinstance(inner, list) else []
     return "\n".join(line for line in lines if line.strip() and not line.lstrip().startswith("#"))
 
 

@@ -2,9 +2,9 @@
 
     python examples/benchmarks/filter_methods.py TRUTH.h5 MEASURED.h5 [--run FOLDER] [--lag 4] [--quick] [--json FILE]
 
-``--run FOLDER`` takes the analysis that `torchsph assimilate` with its defaults has left there instead of making it
-again. Seconds are the processor's, those of the splines that "sph" and "ensemble" start from included; for an analysis
-of a folder a stretch of ``TIMED`` frames is run again, and its seconds are scaled to all frames.
+``--run FOLDER`` takes the analyses of "free", "spline" and "ensemble" that `torchsph assimilate` with its defaults has
+left there instead of making them again. Seconds are the processor's, those of the splines that "sph" and "ensemble"
+start from included; for analyses of a folder a stretch of ``TIMED`` frames is run again, and its seconds are scaled.
 
 Rows: the measurement itself ("raw") and its average over time, the simulation without data ("free"), splines frame by
 frame and averaged over time (Gaussian of 10 ms, in the frames in which a node lies in the mask), the thesis's particle
@@ -30,6 +30,8 @@ from examples.provenance import ANALYSES, write_table
 from torchsph.evaluation.metrics import METRICS, evaluate, filled_velocity, spread_over_skill
 from torchsph.methods import by_name
 from torchsph.methods.by_name import run_methods
+from torchsph.methods.measurement.prepared import PreparedMeasurement
+from torchsph.methods.nudging import filter_sph
 
 SOURCES = ("examples/benchmarks/filter_methods.py", *ANALYSES)
 TIMED = 6  # frames
@@ -41,18 +43,20 @@ class ProcessorClock:
     perf_counter = staticmethod(time.process_time)
 
 
+Rows = dict[str, tuple[geometry.Recording, float]]
+
+
 def table(
     measured: geometry.Recording, truth: geometry.Recording, folder: Path | None, lag: int | None, seed: int
 ) -> dict[str, dict]:
     """One row per method: its measures, seconds and, where it claims an error, the claim over the error."""
     plain = measured.with_velocity(filled_velocity(measured))
     rows = {"raw": (measured, 0.0), "raw over time": (averaged(plain), 0.0)}
-    rows |= made(measured, truth, ("spline", "sph") if folder else ("spline", "sph", "ensemble"), seed)
+    if folder is None:
+        rows |= made(measured, truth, ("spline", "sph", "ensemble"), seed)
+    else:
+        rows |= left(measured, truth, folder, seed)
     rows["spline over time"] = (averaged(rows["spline"][0]), 0.0)
-    if folder is not None:
-        few = measured.select(slice(measured.frames // 2, measured.frames // 2 + TIMED))
-        seconds = made(few, truth, ("spline", "ensemble"), seed)["ensemble"][1] * measured.frames / few.frames
-        rows["ensemble"] = (geometry.read_recording(folder / "ensemble.h5"), seconds)
     if lag is not None:
         rows[f"ensemble, lag {lag}"] = made(measured, truth, ("spline", "ensemble"), seed, lag=lag)["ensemble"]
     return {name: scored(one, truth, measured) | {"seconds": seconds} for name, (one, seconds) in rows.items()}
@@ -60,12 +64,27 @@ def table(
 
 def made(
     measured: geometry.Recording, truth: geometry.Recording, methods: tuple[str, ...], seed: int, **more: int
-) -> dict[str, tuple[geometry.Recording, float]]:
+) -> Rows:
     """What methods make of a measurement, and the processor seconds of each, splines included."""
     found = run_methods(measured, methods, truth=truth, seed=seed, **more)
-    spline = found["spline"].seconds
-    first = {"sph": spline, "ensemble": spline}
+    first = {"sph": found["spline"].seconds, "ensemble": found["spline"].seconds}
     return {name: (one.recording, one.seconds + first.get(name, 0.0)) for name, one in found.items()}
+
+
+def left(measured: geometry.Recording, truth: geometry.Recording, folder: Path, seed: int) -> Rows:
+    """What a folder holds, the thesis's filter run from its splines, and seconds of a stretch scaled to all frames."""
+    few = measured.select(slice(measured.frames // 2, measured.frames // 2 + TIMED))
+    share = measured.frames / few.frames
+    seconds = {name: share * own for name, (_, own) in made(few, truth, ("spline", "ensemble"), seed).items()}
+    rows = {
+        name: (geometry.read_recording(folder / f"{name}.h5"), seconds[name]) for name in ("free", "spline", "ensemble")
+    }
+    began = time.process_time()
+    prepared = PreparedMeasurement(measured, by_name.make_smoother("default"))
+    prepared.smoothed = rows["spline"][0]
+    model = by_name.make_model(measured, spacing=by_name.ANALYSIS_SPACING * min(measured.grid.spacing))
+    run = filter_sph(prepared, model, seed=seed)
+    return rows | {"sph": (run.recording, seconds["spline"] + time.process_time() - began)}
 
 
 def scored(one: geometry.Recording, truth: geometry.Recording, measured: geometry.Recording) -> dict:

@@ -51,10 +51,7 @@ def test_the_notebook_is_one_and_carries_no_outputs():
 
 
 def test_errors_of_the_methods_are_those_of_the_results():
-    found = {
-        noise: result(f"filter_methods_{noise}.json")["measurements"][f"lv_phantom_a_{noise}"]
-        for noise in ("measured", "noisy")
-    }
+    found = {noise: result(f"filter_methods_{noise}.json")["rows"] for noise in ("measured", "noisy")}
     settings, accuracy = text("torchsph/SETTINGS.md"), text("torchsph/ACCURACY.md")
     for method in ("ensemble", "spline", "free", "sph"):
         both = [short(found[noise][method]["nrmse"]) for noise in found]
