@@ -80,8 +80,7 @@ def left(measured: geometry.Recording, truth: geometry.Recording, folder: Path, 
         name: (geometry.read_recording(folder / f"{name}.h5"), seconds[name]) for name in ("free", "spline", "ensemble")
     }
     began = time.process_time()
-    prepared = PreparedMeasurement(measured, by_name.make_smoother("default"))
-    prepared.smoothed = rows["spline"][0]
+    prepared = PreparedMeasurement(measured, smoothed=rows["spline"][0])
     model = by_name.make_model(measured, spacing=by_name.ANALYSIS_SPACING * min(measured.grid.spacing))
     run = filter_sph(prepared, model, seed=seed)
     return rows | {"sph": (run.recording, seconds["spline"] + time.process_time() - began)}

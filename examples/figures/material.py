@@ -17,6 +17,7 @@ import geometry
 import regularize
 import torchsph as ts
 from torchsph.data import sample_measurement, sample_truth
+from torchsph.methods.measurement.prepared import PreparedMeasurement
 
 from ..provenance import ROOT, code_hash
 
@@ -148,7 +149,9 @@ class Material:
             return ts.smooth(measured)
         if method == "sph, thesis":
             model = ts.Simulator(ts.Scene.from_recording(measured, spacing), ts.preset("thesis"))
-            return ts.filter_sph(measured, model, seed=self.seed).recording
+            # its splines tell how noisy the measurement is
+            prepared = PreparedMeasurement(measured, smoothed=self.analysis("spline, default"))
+            return ts.filter_sph(prepared, model, seed=self.seed).recording
         if method == "ensemble, default":
             few = {"spacing": 4e-3, "members": 4} if self.fast else {}
             kept = {} if checkpoint is None else {"checkpoints": checkpoint, "resume": True}
