@@ -30,6 +30,8 @@ class Particles:
         label: (N,) int64, a numbering that survives sorting, or None.
         confidence: (N,), not negative, what a particle's velocity counts for in XSPH and in fetching; None: all alike.
         pressure: (N,), p / rho0 of the last projection, or None (schemes without one).
+        origin: (N, D), where each was when somebody began to follow them (``Simulation.follow``), or None. Of a
+            particle that came later: where it came in.
     """
 
     position: Tensor
@@ -42,6 +44,7 @@ class Particles:
     label: Tensor | None = None
     confidence: Tensor | None = None
     pressure: Tensor | None = None
+    origin: Tensor | None = None
 
     @property
     def count(self) -> int:
@@ -89,6 +92,8 @@ class Particles:
             theirs["confidence"] = torch.ones_like(other.mass)
         if other.pressure is None:
             theirs["pressure"] = torch.zeros_like(other.mass)
+        if other.origin is None:
+            theirs["origin"] = other.position
         return self.changed(**{name: torch.cat([value, theirs[name]]) for name, value in self.arrays().items()})
 
     def repeated(self, members: int) -> Particles:
