@@ -22,7 +22,7 @@ from ..runtime.workers import MOST_WORKERS, chosen_workers, spread
 from .flux_data import with_fluxes
 from .informative import refuse_exact, refuse_silent
 from .unwrapping import unwrapped
-from .wall_rows import at_knots, faces_one_way, mean_certainty, open_regions, wall_rows
+from .wall_rows import at_knots, mean_certainty, open_together, wall_rows
 from .wall_trust import wall_trust
 
 # noise and smoothness are chosen in every third frame and serve its neighbours: flow and noise change over tens of
@@ -219,17 +219,10 @@ class FrameSmoother:
         return fitted
 
     def _open_together(self, frame: int) -> tuple[int, ...]:
-        """Regions at a frame whose fluxes are for the data to say: several, or velocities contradict the walls.
-
-        Openings that face apart are several, also where they share a label.
-        """
+        """Regions at a frame whose fluxes are for the data to say (``open_together``)."""
         if self.motion is None:
             return ()
-        time = float(self.recording.time[frame])
-        regions = open_regions(self.recording, time)
-        if len(regions) == 1 and not self.estimates.contradicted:
-            return () if faces_one_way(self.motion.surface(time), regions[0]) else regions
-        return regions
+        return open_together(self.recording, self.motion, frame, self.estimates.contradicted)
 
     def _trusting(self, frame: int) -> regularize.Smoother:
         """The smoother with the strength that the walls of a frame deserve: less where they are uncertain."""
