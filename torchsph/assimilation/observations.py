@@ -24,6 +24,7 @@ class Reason(IntEnum):
     OUT_OF_REACH = 5  # farther than the localisation radius from every state variable
     THINNED = 6  # dropped beforehand, in favour of a neighbour with a correlated error
     QUALITY = 7  # dropped beforehand by the measurement's own quality flags
+    AMBIGUOUS = 8  # the value has wrapped, and the forecast cannot tell how often
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,7 @@ from ..budget import NAME as SPACING_FILE
 from ..budget import chosen_spacing
 from ..checks import check_spacing, informative, usable_device
 from ..command import Command
-from ..outputs import output_folder, staged, write_json
+from ..outputs import output_folder, staged, write_json, write_result
 from ..printing import print_table, run_config, say
 from ..quantity_tables import CAUTION, QuantityTables, methods_read_out
 from ..running.folder_lock import locked
@@ -203,7 +203,7 @@ def _write(
         tables = QuantityTables.of(analyses[config["analysis"]], results[config["analysis"]].quantities, truth)
     with staged(folder) as scratch:
         for name, recording in analyses.items():
-            geometry.write_recording(scratch / f"{name}.h5", recording, provenance=account | {"method": name})
+            write_result(scratch / f"{name}.h5", recording, account | {"method": name})
         shutil.copyfile(scratch / f"{config['analysis']}.h5", scratch / "analysis.h5")
         for name in () if args.no_sidecar else (*analyses, "analysis"):
             write_sidecar(scratch / f"{name}.h5", analyses[config["analysis"] if name == "analysis" else name])

@@ -32,6 +32,7 @@ NUMBERS = {
     "interval": "s between frames",
     "period": "s of a beat; frames without times are spread over it",
     "grid-spacing": "m, of the grid for tracks or for walls alone",
+    "nyquist": "m/s, at which the velocities wrap (VENC, Doppler)",
 }
 
 

@@ -20,7 +20,7 @@ from ..arguments import add_model_options, add_output_folder, add_seed, add_work
 from ..budget import chosen_spacing
 from ..checks import check_spacing, full_vectors, usable_device
 from ..command import Command
-from ..outputs import output_folder, staged, write_json
+from ..outputs import output_folder, staged, write_json, write_result
 from ..printing import print_table, run_config, say
 from ..running.folder_lock import locked
 from ..running.notes import shows_bar
@@ -76,7 +76,7 @@ def forecast(args: argparse.Namespace) -> None:
     config["info"] = {"provenance": account}
     with locked(folder), staged(folder) as scratch:
         for lead, saved in skill.recordings.items():
-            geometry.write_recording(scratch / f"forecast_{1e3 * lead:g}ms.h5", saved, provenance=account)
+            write_result(scratch / f"forecast_{1e3 * lead:g}ms.h5", saved, account)
         figures.draw_forecast(scratch / "forecast.png", skill.leads)
         write_config(scratch, args)
         found = {"leads": skill.leads, "seconds": skill.seconds, "config": config, "failures": skill.failures}

@@ -21,7 +21,8 @@ from ..runtime.parallel import advanced, shared
 from ..runtime.workers import MOST_WORKERS, chosen_workers, spread
 from .flux_data import with_fluxes
 from .informative import refuse_exact, refuse_silent
-from .wall_rows import at_knots, mean_certainty, open_regions, wall_rows
+from .unwrapping import unwrapped
+from .wall_rows import at_knots, mean_certainty, open_together, wall_rows
 from .wall_trust import wall_trust
 
 # noise and smoothness are chosen in every third frame and serve its neighbours: flow and noise change over tens of
@@ -59,7 +60,7 @@ class FrameSmoother:
             raise ValueError(f"choose_every must be at least 1, got {choose_every}")
         refuse_silent(recording)
         refuse_exact(recording)
-        self.estimates = geometry.estimated(recording) if estimates is None else estimates
+        self.estimates = geometry.estimated(unwrapped(recording)) if estimates is None else estimates
         recording = self.estimates.recording
         self.type = geometry.measurement_type(recording)
         if smoother.automatic and not self.type.full:
@@ -218,11 +219,10 @@ class FrameSmoother:
         return fitted
 
     def _open_together(self, frame: int) -> tuple[int, ...]:
-        """Regions at a frame whose fluxes are for the data to say: several, or velocities contradict the walls."""
+        """Regions at a frame whose fluxes are for the data to say (``open_together``)."""
         if self.motion is None:
             return ()
-        regions = open_regions(self.recording, float(self.recording.time[frame]))
-        return regions if len(regions) > 1 or self.estimates.contradicted else ()
+        return open_together(self.recording, self.motion, frame, self.estimates.contradicted)
 
     def _trusting(self, frame: int) -> regularize.Smoother:
         """The smoother with the strength that the walls of a frame deserve: less where they are uncertain."""

@@ -105,6 +105,9 @@ class ProjectionStepper:
             drift = drift + self._shift(self._shifting, middle.changed(velocity=velocity), gradient, step)
         acceleration = (velocity - before) * rate[:, None]
         after = middle.changed(position=middle.position + drift, velocity=velocity, pressure=pressure)
+        if after.exchange is not None:
+            grown = torch.where(after.inside, after.exchange * dt, torch.zeros_like(dt))
+            after = after.changed(mass=after.mass * grown.exp())
         return Stepped(after, acceleration, None if wall is None else _earlier(wall, half, before))
 
     @staticmethod
@@ -144,7 +147,9 @@ class ProjectionStepper:
 
     def _source(self, surroundings: Neighbourhood, sums: Rates, divergence: Tensor) -> tuple[Tensor, Tensor | None]:
         """Source of the pressure (N,), and which particles lie at a free surface (N,) bool, or None."""
-        surface, source = None, -divergence
+        surface, source, exchange = None, -divergence, surroundings.particles.exchange
+        if exchange is not None:
+            source = source + torch.where(surroundings.particles.inside, exchange, torch.zeros_like(exchange))
         if not self._terms.shepard:
             return source, surface
         filling = surroundings.filling(sums)
