@@ -127,12 +127,13 @@ class Forecaster:
         """
         count, here = len(ensemble.members), (start, mask, times, masks)
         batches = [slice(first, min(first + self.batch, count)) for first in range(0, count, self.batch)]
-        # the control is the longest of the runs and has walls of its own: the first process begins with it
+        # the control is the longest of the runs: the first process has it. Batches of one model share walls and seeding
         (control, covered, shock, pressure, steps), *runs = shared(
             [
                 partial(self._control, ensemble, *here),
                 *(partial(self._members, ensemble, these, *here) for these in batches),
-            ]
+            ],
+            taken_over=self.coarse is self.model,
         )
         fields, steps = torch.cat([run.fields for run in runs], 1), steps + sum(run.steps for run in runs)
         fields, control, rates = self._parted(fields, control, len(times))

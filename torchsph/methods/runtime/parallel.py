@@ -181,18 +181,23 @@ def advanced(bar: Bar) -> None:
 # --- exchanges: every process has to call them, in the same order ----------------------------------
 
 
-def shared(tasks: Sequence[Callable[[], T]]) -> list[T]:
+def shared(tasks: Sequence[Callable[[], T]], *, taken_over: bool = True) -> list[T]:
     """The results of independent tasks, each done by one process and told to all.
 
     Each process begins with a stretch of its own, because neighbours often have something in common, and who is free
     takes what nobody has begun, so that none waits long for another that the machine holds up. No task may change what
     another one, or what comes after, depends on: what it changes is changed in one process alone. Every process has to
     call this, with tasks of the same number and meaning.
+
+    Args:
+        tasks: the work.
+        taken_over: whether a process that is free takes tasks of another's stretch; not where what these have in common
+            would have to be made anew.
     """
     if processes() == 1:
         return [task() for task in tasks]
     done: dict[int, _Done[T]] = {}
-    for own in _told_to_all({k: _done(tasks[k]) for k in _taken(len(tasks))}):
+    for own in _told_to_all({k: _done(tasks[k]) for k in _taken(len(tasks), taken_over)}):
         done |= own
     for k in range(len(tasks)) if is_lead() else ():
         for text, kind in done[k].warned:
@@ -217,9 +222,12 @@ def _done(task: Callable[[], T]) -> _Done[T]:
     return _Done(result, [(str(one.message), one.category) for one in told])
 
 
-def _taken(count: int) -> Iterator[int]:
+def _taken(count: int, over: bool) -> Iterator[int]:
     """Numbers of the tasks that this process is to do, each claimed when the one before is done."""
     group = _group
+    if not over:
+        yield from _stretch(count, rank(), processes())
+        return
     if group is None:  # a process group of the caller's, whose store nobody knows: in turn
         yield from range(rank(), count, processes())
         return
@@ -231,8 +239,13 @@ def _taken(count: int) -> Iterator[int]:
 
 def _order(count: int, own: int, group: int) -> list[int]:
     """In which order a process of a group looks for tasks: its own stretch, then what the others come to last."""
-    first, end = count * own // group, count * (own + 1) // group
-    return [*range(first, end), *reversed([*range(end, count), *range(first)])]
+    stretch = _stretch(count, own, group)
+    return [*stretch, *reversed([*range(stretch.stop, count), *range(stretch.start)])]
+
+
+def _stretch(count: int, own: int, group: int) -> range:
+    """The tasks of a process of a group, as many as those of any other."""
+    return range(count * own // group, count * (own + 1) // group)
 
 
 def shared_pair(first: Callable[[], A], second: Callable[[], B]) -> tuple[A, B]:

@@ -23,7 +23,7 @@ from torchsph.cli import main
 from torchsph.data import sample_measurement
 from torchsph.methods.memory import MemoryPrediction
 from torchsph.methods.runtime import cores
-from torchsph.methods.runtime.parallel import _order
+from torchsph.methods.runtime.parallel import _order, _stretch
 from torchsph.methods.runtime.workers import KilledWorker, LostWorker, _living, chosen_workers, spread
 
 
@@ -54,6 +54,7 @@ def test_every_task_is_done_once_and_told_to_all_with_its_warnings():
 def test_stretches_cover_all_tasks_once_and_everybody_comes_to_all_in_the_end(count, group):
     orders = [_order(count, own, group) for own in range(group)]
     assert all(sorted(order) == list(range(count)) for order in orders)
+    assert [k for own in range(group) for k in _stretch(count, own, group)] == list(range(count))
     if count == 10:
         assert orders == [
             [0, 1, 2, 9, 8, 7, 6, 5, 4, 3],
