@@ -88,9 +88,9 @@ def run_methods(
     file to which the ensemble's are written.
 
     ``workers`` processes of one thread each, this one among them, share the splines and the ensemble, with the same
-    result to the last bit for any number; the first one runs "sph" meanwhile and the last one "free". None: as many as
-    this process may use cores, as the ensemble can give work to and as fit into the memory. Under torchrun its
-    processes share the run in the same way, and what the first one returns is complete.
+    result to the last bit for any number; "free" and "sph" have one each. None: as many as this process may use cores,
+    as the ensemble can give work to and as fit into the memory. Under torchrun its processes share the run in the same
+    way, and what the first one returns is complete.
 
     Raises:
         ValueError: an unknown method, "sph" on a measurement of components alone, or a checkpoint of another run.

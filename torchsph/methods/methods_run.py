@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import time as clock
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from .ensemble.assimilate import EnsembleRun, assimilate, default_filter, furthe
 from .ensemble.identity import ensemble_key
 from .ensemble.options import EnsembleOptions
 from .free_run import run_freely
+from .measurement.error_model import ObservationError
 from .measurement.prepared import PreparedMeasurement
 from .members.amplitude import Amplitude
 from .members.draws import spline_frames
@@ -23,7 +25,7 @@ from .members.quantities import MemberCurves, MemberQuantities, quantified, with
 from .models import Models
 from .nudging import filter_sph
 from .runtime.checkpoint import Saved
-from .runtime.parallel import from_last, is_last, is_lead
+from .runtime.parallel import is_lead, processes, shared
 from .runtime.watching import Watcher
 
 METHODS = ("free", "spline", "sph", "ensemble")
@@ -103,20 +105,46 @@ class MethodsRun:
             drawn = self._drawn() if "spline" in self.quantities and is_lead() else None
             told = {"smoother": repr(self.prepared.splines.smoother)} | account
             results["spline"] = timer.result(with_pressure(smoothed, drawn), told, drawn)
-        if is_last() and set(self.methods) != {"spline"}:
-            free = run_freely(
-                self.measured, self.models.coarse, smoothed.velocity[0], seed=self.seed, progress=progress
-            )
-            results["free"] = timer.result(free)
-        if is_lead() and "sph" in self.methods:
-            run = filter_sph(self.prepared, self.models.coarse, seed=self.seed, progress=progress)
-            results["sph"] = timer.result(run.recording, run.info)
+        before = timer.passed()
+        results |= self._single_runs(smoothed, 0.0 if "spline" in self.methods else before, progress)
+        timer.passed()
         if "ensemble" in self.methods:
             done, curves = self._ensemble(watcher, progress)
             results["ensemble"] = timer.result(with_pressure(done.recording, curves), done.info | account, curves)
-        free_run = from_last(results.get("free"))
-        known = results if free_run is None else results | {"free": free_run}
-        return {name: known[name] for name in METHODS if name in known}
+        return {name: results[name] for name in METHODS if name in results}
+
+    def _single_runs(self, smoothed: geometry.Recording, before: float, progress: bool) -> dict[str, MethodResult]:
+        """The runs of one member and the error model, shared among the processes.
+
+        Args:
+            smoothed: the splines.
+            before: seconds that went into them, where no result of theirs counts them.
+            progress: show bars.
+        """
+        prepared, coarse = self.prepared, partial(getattr, self.models, "coarse")
+
+        def free() -> MethodResult:
+            timer = _Timer()
+            run = run_freely(self.measured, coarse(), smoothed.velocity[0], seed=self.seed, progress=progress)
+            found = timer.result(run)
+            return replace(found, seconds=found.seconds + before)
+
+        def nudged() -> MethodResult:
+            timer, run = _Timer(), filter_sph(prepared, coarse(), seed=self.seed, progress=progress)
+            return timer.result(run.recording, run.info)
+
+        tasks: dict[str, Callable[[], MethodResult | ObservationError]] = {}
+        if processes() > 1 and {"sph", "ensemble"} & set(self.methods):  # one alone makes it when it is asked for
+            tasks["error"] = lambda: prepared.error
+        if "sph" in self.methods:
+            tasks["sph"] = nudged
+        if set(self.methods) != {"spline"}:
+            tasks["free"] = free
+        found = dict(zip(tasks, shared(list(tasks.values())), strict=True))
+        for one in found.values():
+            if isinstance(one, ObservationError):
+                prepared.__dict__["error"] = one  # where the cached property keeps it
+        return {name: one for name, one in found.items() if isinstance(one, MethodResult)}
 
     def _ensemble(self, watcher: Watcher | None, progress: bool) -> tuple[EnsembleRun, MemberCurves | None]:
         """The ensemble's analyses, and what its members give where it is asked for."""
@@ -158,12 +186,16 @@ class _Timer:
     def __init__(self) -> None:
         self.began = clock.perf_counter()
 
+    def passed(self) -> float:
+        """Seconds since the last result, which no result counts."""
+        ended = clock.perf_counter()
+        passed, self.began = ended - self.began, ended
+        return passed
+
     def result(
         self,
         recording: geometry.Recording,
         info: dict[str, Any] | None = None,
         quantities: MemberCurves | None = None,
     ) -> MethodResult:
-        ended = clock.perf_counter()
-        seconds, self.began = ended - self.began, ended
-        return MethodResult(recording, seconds, {} if info is None else info, quantities)
+        return MethodResult(recording, self.passed(), {} if info is None else info, quantities)

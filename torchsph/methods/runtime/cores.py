@@ -31,6 +31,7 @@ def _quota(root: Path = Path("/sys/fs/cgroup"), own: Path = Path("/proc/self/cgr
     except OSError:
         return None
     found: list[float] = []
+    names: tuple[str, ...]
     for _, controllers, path in entries:
         if controllers == "":
             base, names = root, ("cpu.max",)

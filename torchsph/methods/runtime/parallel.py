@@ -305,4 +305,4 @@ def _packed(value: object) -> Tensor:
 
 
 def _unpacked(packed: Tensor) -> Any:
-    return pickle.loads(memoryview(packed.numpy()))
+    return pickle.loads(packed.numpy().data)

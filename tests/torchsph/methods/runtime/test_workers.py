@@ -122,6 +122,32 @@ def test_the_command_writes_how_many_processes_there_were_and_the_same_file(tmp_
     np.testing.assert_array_equal(found[1].velocity, found[2].velocity)
 
 
+@pytest.mark.slow  # a minute
+def test_assimilate_writes_the_same_with_workers_and_tells_of_their_memory(tmp_path):
+    geometry.write_recording(tmp_path / "m.h5", geometry.read_recording(sample_measurement()).select(slice(9, 12)))
+    given = ["assimilate", str(tmp_path / "m.h5"), "--method", "spline,sph,ensemble", "--members", "9", "--no-page"]
+    peaks = {}
+    for workers in ("1", "2"):
+        status = tmp_path / f"{workers}.jsonl"
+        more = ["--spacing", "4e-3", "--out", str(tmp_path / workers), "--workers", workers, "--status", str(status)]
+        assert main([*given, *more]) == 0
+        lines = [json.loads(line) for line in status.read_text().splitlines()]
+        assert [line["event"] for line in lines] == ["begun", "frame", "frame", "frame", "done"]
+        peaks[workers] = lines[2]["peak"]
+        told = json.loads((tmp_path / workers / "metrics.json").read_text())["config"]["info"]["provenance"]
+        assert told["processes"] == int(workers)
+        assert {path.name for path in (tmp_path / workers).iterdir()} >= {"free.h5", "sph.h5", "quantities.json"}
+        assert not list((tmp_path / workers).glob("checkpoint*"))
+    assert peaks["2"] > peaks["1"] + (100 << 20)
+    for name in ("free", "spline", "sph", "ensemble"):
+        one, two = (geometry.read_recording(tmp_path / workers / f"{name}.h5").arrays() for workers in ("1", "2"))
+        assert one.keys() == two.keys()
+        for key in one:
+            np.testing.assert_array_equal(one[key], two[key], err_msg=f"{name} {key}")
+    one, two = ((tmp_path / workers / "quantities.csv").read_bytes() for workers in ("1", "2"))
+    assert one == two
+
+
 def test_workers_are_refused_where_there_are_processes_already(measured, monkeypatch):
     monkeypatch.setenv("WORLD_SIZE", "2")
     assert chosen_workers(None, 8) == 1
