@@ -252,9 +252,7 @@ class PresentSurroundings:
             points = domain.valves.open_points(self.clock)
             if points is not None:
                 wanted = wanted - domain.valves.through_open(self._at_points(grid, fields, points), self.clock)
-        self.exchange_field = Exchange(grid, fields, mask, domain.units, domain.scene.spacing)
-        if wanted is not None:
-            self.exchange_field.level(particles, wanted)
+        self.exchange_field = Exchange(grid, fields, mask, domain.units, domain.scene.spacing, wanted)
         return self.exchange_field.carried(particles)
 
     def _at_points(self, grid: Grid, fields: Tensor, points: Tensor) -> Tensor:

@@ -123,6 +123,8 @@ class Analyses:
             self.lagged.restore(state["lagged"])
 
     def _clean(self, control: Tensor, frame: int) -> Tensor:
+        if self.measured.cut:  # its divergence is what passes through the plane
+            return control.to(torch.float32)
         mask = np.array(self.measured.mask[frame], bool)
         field = control.numpy() if self.balance is None else self.balance.nearest(control.numpy(), frame)
         found = without_divergence(field, mask, self.measured.grid.spacing)
