@@ -12,7 +12,7 @@ from geometry.grids.fields import convolve_axis
 # the potential grows from the wall over this many correlation lengths
 _WALL_LAYER = 1.5
 # RMS of a plane's divergence over that of its vorticity, in isotropic turbulence that has none in space: <(dw/dz)^2> is
-# a fifth of <(du/dy - dv/dx)^2> (G. I. Taylor, Proc. R. Soc. A 151 (1935) 421)
+# a fifth of <(du/dy - dv/dx)^2> (Taylor 1935)
 _ACROSS = 5**-0.5
 
 

@@ -30,7 +30,7 @@ from .wall_trust import wall_trust
 CHOICE_EVERY = 3
 # strength of the divergence's penalty in a plane cut out of a flow, in knot distances, sqrt(2) times smoothness's: in
 # isotropic turbulence without divergence <(du/dx + dv/dy)^2> in a plane is a third of what independent components
-# with the same <|grad v|^2> have (G. I. Taylor, Proc. R. Soc. A 151 (1935) 421); at the scale that smoothness cuts off
+# with the same <|grad v|^2> have (Taylor 1935); at the scale that smoothness cuts off
 # two thirds of it are held back so
 OF_A_CUT = 2**0.5 / CURVATURE
 
