@@ -3,10 +3,10 @@
     python examples/error_seconds.py [--measure] [--out error_seconds.png]
 
 Drawn from results that are in the checkout: `benchmarks/results/speed_error.json` (schemes and steps),
-`filter_methods_*.json` (methods of torchsph), `spline_phantom.json`, `rivals/results/rivals.json` and, for presets,
-spacings, precisions and backends, `error_seconds.json` beside it, which `--measure` makes: row by row, those that are
-there already are kept. A black line joins what nothing else beats in error and seconds at once (the Pareto front).
-Seconds are CPU seconds of one thread; of the methods wall seconds of a shared machine, an upper bound.
+`filter_methods_*.json` (methods of torchsph), `rivals/results/rivals.json` and, for presets, spacings, precisions and
+backends, `error_seconds.json` beside them, which `--measure` makes: row by row, those that the present code has made
+are kept. A black line joins what nothing else beats in error and seconds at once (the Pareto front). Seconds are CPU
+seconds of one thread.
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ from matplotlib.ticker import NullFormatter
 
 import geometry
 import torchsph as ts
+from examples.provenance import MODEL, stale, write_table
 from torchsph.data import sample_truth
 
 HERE = Path(__file__).resolve().parent
@@ -40,10 +41,10 @@ INPUTS = (
     RESULTS / "speed_error.json",
     RESULTS / "filter_methods_measured.json",
     RESULTS / "filter_methods_noisy.json",
-    RESULTS / "spline_phantom.json",
     OWN,
     RIVALS,
 )
+SOURCES = ("examples/error_seconds.py", "torchsph/methods/forecast_skill.py", *MODEL)
 LEADS = (0.01, 0.02, 0.04)  # s
 ROWS = {  # name -> preset, spacing (mm), precision, backend
     "default, 3 mm": ("default", 3.0, torch.float32, "auto"),
@@ -77,13 +78,19 @@ def measured(preset: str, spacing: float, dtype: torch.dtype, backend: str) -> d
     return {"error": sum(ratios) / len(ratios), "cpu_s": time.process_time() - began}
 
 
+def own_rows() -> dict[str, dict[str, float]]:
+    """The rows that `--measure` has made."""
+    return json.loads(OWN.read_text(encoding="utf-8"))["rows"] if OWN.is_file() else {}
+
+
 def measure() -> None:
-    """Make the rows that are missing."""
-    rows = json.loads(OWN.read_text(encoding="utf-8")) if OWN.is_file() else {}
+    """Make the rows that are missing, all of them where code has changed since."""
+    current = OWN.is_file() and not stale(json.loads(OWN.read_text(encoding="utf-8")))
+    rows = own_rows() if current else {}
     for name, options in ROWS.items():
         if name not in rows:
             rows[name] = measured(*options)
-            OWN.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+            write_table(OWN, {"rows": rows}, SOURCES)
             print(f"{name}: {rows[name]['error']:.3f} in {rows[name]['cpu_s']:.1f} s", file=sys.stderr)
 
 
@@ -94,21 +101,17 @@ def forecasts() -> list[Point]:
         for row in json.loads(INPUTS[0].read_text(encoding="utf-8"))["rows"]
         if row["flow"] == "ventricle"
     ]
-    own = json.loads(OWN.read_text(encoding="utf-8")) if OWN.is_file() else {}
-    return points + [Point(name, row["cpu_s"], row["error"], name.split(",")[0]) for name, row in own.items()]
+    return points + [Point(name, row["cpu_s"], row["error"], name.split(",")[0]) for name, row in own_rows().items()]
 
 
 def analyses(noise: str) -> list[Point]:
-    """Points of a panel for one level of noise: methods of torchsph, a Gaussian, rivals."""
-    file = f"lv_phantom_a_{noise}"
-    table = json.loads((RESULTS / f"filter_methods_{noise}.json").read_text(encoding="utf-8"))["measurements"][file]
+    """Points of a panel for one level of noise: methods of torchsph, and rivals."""
+    table = json.loads((RESULTS / f"filter_methods_{noise}.json").read_text(encoding="utf-8"))["rows"]
     left_out = ("raw", "raw over time", "spline over time")  # no seconds of their own
-    points = [
-        Point(name, row["seconds"], row["nrmse"], "torchsph") for name, row in table.items() if name not in left_out
-    ]
-    rivals = json.loads(RIVALS.read_text(encoding="utf-8"))["rows"] if RIVALS.is_file() else {}
-    found = rivals.get(noise, {})
-    return points + [Point(name, row["seconds"], row["nrmse"], "rival") for name, row in found.items()]
+    own = [Point(name, row["seconds"], row["nrmse"], "torchsph") for name, row in table.items() if name not in left_out]
+    rows = json.loads(RIVALS.read_text(encoding="utf-8"))["rows"].get(noise, {}) if RIVALS.is_file() else {}
+    others = {name: row for name, row in rows.items() if name not in ("raw", "spline", "ensemble")}
+    return own + [Point(name, row["seconds"], row["nrmse"], "rival") for name, row in others.items()]
 
 
 def front(points: list[Point]) -> list[Point]:

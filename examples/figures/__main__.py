@@ -10,9 +10,10 @@ from pathlib import Path
 import torch
 from tqdm import tqdm
 
+from ..provenance import ROOT, code_hash
 from . import __doc__ as about
 from .material import Material
-from .record import ROOT, Claim, code_hash, is_current, write
+from .record import Claim, is_current, write
 from .registry import FIGURES, Entry
 from .style import save
 from .table import page

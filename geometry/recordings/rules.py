@@ -16,6 +16,7 @@ from geometry.surfaces.surface import SurfaceError
 from .errors import RecordingError
 from .recording import RULES, Recording
 
+MOST = 1e6  # m3 or m3/s: beyond it, numbers are no volumes in any unit
 FASTEST = 20.0  # m/s; blood never is as fast, so larger numbers are mm/s or cm/s
 
 # Far beyond every flow that somebody measures; numbers outside would run out of memory, time or floating-point range.
@@ -268,6 +269,10 @@ def _series(recording: Recording, source: str) -> None:
         values = recording.arrays().get(dataset)
         if values is not None and not np.isfinite(values).all():
             raise RecordingError(source, dataset, "must be finite at every frame")
+        if values is not None and values.size and np.abs(values).max() > MOST:
+            unit = "m3" if dataset == "/volume" else "m3/s"
+            rule = f"reaches {np.abs(values).max():g} {unit}, which no heart holds or moves"
+            raise RecordingError(source, dataset, f"{rule}; give {unit} (ml times 1e-6), or leave it out")
     for flux in recording.fluxes:
         flux.check(source)
     if recording.uncovered is not None and (recording.uncovered < 0).any():

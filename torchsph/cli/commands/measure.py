@@ -13,6 +13,7 @@ from torchsph.evaluation import figures, metrics
 from ..arguments import add_seed, number, whole
 from ..checks import output_file
 from ..command import Command
+from ..outputs import write_result
 from ..printing import print_table, say
 from ..running.notes import shows_bar
 from ..running.provenance import provenance
@@ -101,7 +102,7 @@ def measure(args: argparse.Namespace) -> None:
         raise ValueError(f"{', '.join(foreign)}: means nothing with --mode {args.mode}")
     true = geometry.read_recording(args.true)
     measured = make(true, kind(**given), args.seed, progress=shows_bar(args))
-    geometry.write_recording(path, measured, provenance=provenance(args, {"true": args.true}))
+    write_result(path, measured, provenance(args, {"true": args.true}))
     if geometry.measurement_type(measured).full:
         print_table(figures.scores_table({"raw": metrics.evaluate(measured, true)}, {}))
     say(f"wrote {len(measured.time)} frames to {path}")

@@ -31,6 +31,8 @@ class Particles:
         confidence: (N,), not negative, what a particle's velocity counts for in XSPH and in fetching; None: all alike.
         pressure: (N,), p / rho0 of the last projection, or None (schemes without one).
         exchange: (N,), rate at which volume comes in through a plane that is cut out of a flow, or None.
+        origin: (N, D), where each was when somebody began to follow them (``Simulation.follow``), or None. Of a
+            particle that came later: where it came in.
     """
 
     position: Tensor
@@ -44,6 +46,7 @@ class Particles:
     confidence: Tensor | None = None
     pressure: Tensor | None = None
     exchange: Tensor | None = None
+    origin: Tensor | None = None
 
     @property
     def count(self) -> int:
@@ -93,6 +96,8 @@ class Particles:
             theirs["pressure"] = torch.zeros_like(other.mass)
         if other.exchange is None:
             theirs["exchange"] = torch.zeros_like(other.mass)
+        if other.origin is None:
+            theirs["origin"] = other.position
         return self.changed(**{name: torch.cat([value, theirs[name]]) for name, value in self.arrays().items()})
 
     def repeated(self, members: int) -> Particles:

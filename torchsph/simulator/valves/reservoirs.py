@@ -73,8 +73,7 @@ class Reservoirs(ValveModel):
         """What drives the buffers of valves with a given pressure, or None."""
         if not self.openings.given:
             return None
-        unit = self._density * self.units.speed**2
-        s = self._setting
+        unit, s = self._density * self.units.speed**2, self._setting
         return PressureReservoirs(self.openings, backend, s.support_radius, unit, s.period, s.device)
 
     def _deficit(self, particles: Particles, clock: Clock) -> Tensor:
@@ -92,7 +91,6 @@ class Reservoirs(ValveModel):
         return deficit / (self.volume.volume(times) * self.relaxation)
 
     def _lead(self, number: int, clock: Clock, members: int) -> float | Tensor:
-        """See ``free_channel.free_length``."""
         return free_length(self.openings, self.volume, self._run_out, number, clock, members)
 
     def split_points(self, clock: Clock) -> Tensor | None:

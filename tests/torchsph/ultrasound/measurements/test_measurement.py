@@ -185,6 +185,7 @@ def plane():
     )
 
 
+@pytest.mark.slow
 def test_a_plane_is_measured_along_parallel_beams_and_in_a_sector(tmp_path):
     true, options = plane(), SpeckleOptions(training=4, every=2)
     sector = dataclasses.replace(options, apex=(0.0, 0.0), depth=30e-3)
