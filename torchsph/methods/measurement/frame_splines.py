@@ -228,9 +228,8 @@ class FrameSmoother:
 
     def _open_together(self, frame: int) -> tuple[int, ...]:
         """Regions at a frame whose fluxes are for the data to say (``open_together``)."""
-        if self.motion is None:
-            return ()
-        return open_together(self.recording, self.motion, frame, self.estimates.contradicted)
+        found, motion = self.estimates.contradicted, self.motion
+        return () if motion is None else open_together(self.recording, motion, frame, found)
 
     def _trusting(self, frame: int) -> regularize.Smoother:
         """The smoother with the strength that the walls of a frame deserve: less where they are uncertain."""
