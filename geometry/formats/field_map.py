@@ -44,6 +44,7 @@ class FieldMap:
         grid_spacing: m, of the grid that tracks, or the inside of a wall, are put on.
         bin: frames of tracks that make one volume; 0 = all of them.
         nyquist: m/s, at which each component wraps.
+        cut: whether a plane is cut out of a flow in space.
     """
 
     velocity: tuple[str, ...] = ()
@@ -67,6 +68,7 @@ class FieldMap:
     grid_spacing: float | None = None
     bin: int = 0
     nyquist: float | None = None
+    cut: bool = False
 
     def __post_init__(self) -> None:
         if self.axes and self.axes != "auto":

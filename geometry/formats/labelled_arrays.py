@@ -70,6 +70,7 @@ def to_xarray(recording: Recording) -> xarray.Dataset:
     coordinates["time"] = ("time", recording.time, {"units": "s", "axis": "T", "long_name": "time in the beat"})
     coordinates["component"] = ("component", list("xyz"[: recording.dimension]), {})
     about = {name: getattr(recording, name) for name in ("rho", "mu", "period", "description")}
+    about |= {"cut": 1} if recording.cut else {}
     lattice = {"origin": np.array(grid.origin), "spacing": np.array(grid.spacing)}
     return xarray.Dataset(variables, coordinates, {"Conventions": "CF-1.11", **about, **lattice})
 
@@ -96,6 +97,7 @@ def from_xarray(dataset: xarray.Dataset) -> Recording:
     wall = {name[5:]: array for name, array in values.items() if name.startswith("wall.")}
     rest = {name: array for name, array in values.items() if not name.startswith("wall.")}
     about = {name: dataset.attrs[name] for name in ("rho", "mu", "period", "description") if name in dataset.attrs}
+    about |= {"cut": True} if dataset.attrs.get("cut") else {}
     whole: dict[str, Any] = {**rest, **about, **({"wall": Wall(**wall)} if wall else {})}
     labels = {str(label).replace("flux_", f"{GROUP}/", 1): label for label in dataset.variables}
     whole["fluxes"] = fluxes_of({name: dataset[label].values for name, label in labels.items() if is_flux(name)})

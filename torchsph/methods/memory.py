@@ -31,9 +31,9 @@ _ROWS_KEPT = 64 << 20
 _PER_PARTICLE = {2: 1_000, 3: 3_000}  # bytes of state, neighbours and sums
 _TABLES_KEPT, _TABLE_MEMORY = 24, 1 << 29  # as `simulator.walls.fields` keeps them
 _SETS_OF_OPENINGS = 2  # tables for each key time: valves open and close in between
-_TABLES_IN_MAKING = 4  # what transforms and distances take while one is made
+_TABLES_IN_MAKING = 3  # what transforms and distances take while one is made
 _PROGRAM = 250 << 20  # a worker with all that it has imported, before its work
-_LIBRARIES = 30 << 20  # what is loaded at the first fit and the first step
+_LIBRARIES = 36 << 20  # what is loaded at the first fit and the first step
 _COPIES_OF_RECORDING, _COPIES_OF_MEMBERS = 10, 6
 
 

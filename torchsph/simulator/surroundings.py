@@ -76,6 +76,8 @@ class PresentSurroundings:
         """Go on by ``step`` (members,), internal; the particles with what buffers do at that time."""
         self.at(self.clock.of_members(particles.members) + step.double() * self.domain.units.time)
         if self.exchange_field is not None:
+            if not self.clock.open_regions:  # nothing else can fill the walls
+                self.exchange_field.wanted = self._area_rate(particles)
             particles = self.exchange_field.carried(particles)
         return self.domain.valves.driven(particles, self.clock)
 
@@ -244,18 +246,20 @@ class PresentSurroundings:
 
         Together that is what the walls' area takes in and the openings in the plane do not pass.
         """
-        domain, wanted = self.domain, None
-        if domain.walls is not None:
-            motion = domain.walls.motion
-            change = motion.volume_rate(self.clock.middle) * domain.units.time / domain.units.length**motion.dimension
-            wanted = torch.full((particles.members,), change, dtype=domain.dtype, device=domain.device)
-            points = domain.valves.open_points(self.clock)
-            if points is not None:
-                wanted = wanted - domain.valves.through_open(self._at_points(grid, fields, points), self.clock)
-        self.exchange_field = Exchange(grid, fields, mask, domain.units, domain.scene.spacing)
-        if wanted is not None:
-            self.exchange_field.level(particles, wanted)
+        domain, wanted = self.domain, self._area_rate(particles)
+        points = domain.valves.open_points(self.clock)
+        if wanted is not None and points is not None:
+            wanted = wanted - domain.valves.through_open(self._at_points(grid, fields, points), self.clock)
+        self.exchange_field = Exchange(grid, fields, mask, domain.units, domain.scene.spacing, wanted)
         return self.exchange_field.carried(particles)
+
+    def _area_rate(self, particles: Particles) -> Tensor | None:
+        """Change of the area within the walls, internal, of each member (members,); None without walls."""
+        walls, units = self.domain.walls, self.domain.units
+        if walls is None:
+            return None
+        change = walls.motion.volume_rate(self.clock.first) * units.time / units.length**walls.motion.dimension
+        return torch.full((particles.members,), change, dtype=self.domain.dtype, device=self.domain.device)
 
     def _at_points(self, grid: Grid, fields: Tensor, points: Tensor) -> Tensor:
         """(B, n, D), internal, of fields (B, D, *shape), m/s, at points (n, D), internal."""

@@ -124,7 +124,8 @@ class Analyses:
             self.lagged.restore(state["lagged"])
 
     def _clean(self, control: Tensor, frame: int) -> Tensor:
-        if is_worker():  # only what is given out is cleaned, and a worker gives out nothing
+        # what a worker has is given out by nobody; a cut plane's divergence is what passes through it
+        if is_worker() or self.measured.cut:
             return control.to(torch.float32)
         mask = np.array(self.measured.mask[frame], bool)
         field = control.numpy() if self.balance is None else self.balance.nearest(control.numpy(), frame)

@@ -15,6 +15,7 @@ from tqdm import tqdm
 import geometry
 import regularize
 from geometry.arguments import between, checked
+from regularize.options import BY_DATA, CURVATURE
 from regularize.solvers.factor import Factor
 
 from ..runtime.parallel import advanced, shared
@@ -28,6 +29,11 @@ from .wall_trust import wall_trust
 # noise and smoothness are chosen in every third frame and serve its neighbours: flow and noise change over tens of
 # milliseconds, and a choice costs four times a fit
 CHOICE_EVERY = 3
+# strength of the divergence's penalty in a plane cut out of a flow, in knot distances, sqrt(2) times smoothness's: in
+# isotropic turbulence without divergence <(du/dx + dv/dy)^2> in a plane is a third of what independent components
+# with the same <|grad v|^2> have (Taylor 1935); at the scale that smoothness cuts off
+# two thirds of it are held back so
+OF_A_CUT = 2**0.5 / CURVATURE
 
 
 def node_weights(recording: geometry.Recording, frame: int) -> np.ndarray:
@@ -67,6 +73,8 @@ class FrameSmoother:
             smoother = smoother.fixed()  # there is no automatic choice from components alone
         if smoother.spacing is None:
             smoother = replace(smoother, spacing=recording.grid.spacing)
+        if recording.cut and smoother.divergence == BY_DATA:
+            smoother = replace(smoother, divergence=OF_A_CUT * max(smoother.knots_at(recording.grid.spacing)))
         self.motion: geometry.WallMotion | None = None
         self._sampler: geometry.WallSampler | None = None
         if recording.wall is not None:
@@ -220,9 +228,8 @@ class FrameSmoother:
 
     def _open_together(self, frame: int) -> tuple[int, ...]:
         """Regions at a frame whose fluxes are for the data to say (``open_together``)."""
-        if self.motion is None:
-            return ()
-        return open_together(self.recording, self.motion, frame, self.estimates.contradicted)
+        found, motion = self.estimates.contradicted, self.motion
+        return () if motion is None else open_together(self.recording, motion, frame, found)
 
     def _trusting(self, frame: int) -> regularize.Smoother:
         """The smoother with the strength that the walls of a frame deserve: less where they are uncertain."""

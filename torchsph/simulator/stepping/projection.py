@@ -17,6 +17,7 @@ from ..schemes.projection import Projection
 from ..state.neighbour_list import PairSearch
 from ..state.particles import Particles
 from ..state.record import Record
+from ..transfer.exchange import grown
 from ..walls.interface import FluidAtWalls, WallSample
 from ..walls.registry import wall_forces
 from .coefficients import Coefficients
@@ -106,8 +107,7 @@ class ProjectionStepper:
         acceleration = (velocity - before) * rate[:, None]
         after = middle.changed(position=middle.position + drift, velocity=velocity, pressure=pressure)
         if after.exchange is not None:
-            grown = torch.where(after.inside, after.exchange * dt, torch.zeros_like(dt))
-            after = after.changed(mass=after.mass * grown.exp())
+            after = grown(after, dt)
         return Stepped(after, acceleration, None if wall is None else _earlier(wall, half, before))
 
     @staticmethod

@@ -19,6 +19,9 @@ from .imposing import fill_beyond
 
 # FWHM of the average over the divergence on the grid, in particle spacings: finer ones are the transfer's own
 _WIDTH = 2.0
+# volumes of particles, relative to that of their spacing, between which they follow what comes in: sums over particles
+# of very different sizes are rough, and evening out moves what is missing
+_SIZES = (0.5, 2.0)
 
 
 class Exchange:
@@ -30,27 +33,33 @@ class Exchange:
         mask: (*shape) bool.
         units: of the particles.
         spacing: m, of the particles.
+        wanted: (members,), internal, what comes in per time within the walls together; None: what the fields have.
     """
 
-    def __init__(self, grid: Grid, fields: Tensor, mask: Tensor, units: Units, spacing: float) -> None:
+    def __init__(
+        self, grid: Grid, fields: Tensor, mask: Tensor, units: Units, spacing: float, wanted: Tensor | None
+    ) -> None:
         steps = tuple(grid.spacing)
         rough = torch.stack([masked_gradient(one, mask, steps).diagonal().sum(-1) for one in fields])
         even = masked_blur(rough, mask, fwhm_to_deviation(_WIDTH * spacing), steps)
-        self.grid, self.units = grid, units
+        self.grid, self.units, self.wanted = grid, units, wanted
         self._rate = fill_beyond(even[:, None], mask, grid, None)[:, 0] * units.time
 
     def carried(self, particles: Particles) -> Particles:
-        """Particles with the rates at their places; those outside the walls have none."""
+        """Particles with the rates at their places; those outside the walls have none.
+
+        A constant for each member is added, so that together they take in what ``wanted`` says: heavy particles gather
+        where much comes in, and would let the whole grow.
+        """
+        inside = particles.inside
         sampled = self.grid.sample(self._rate, particles.position * self.units.length)
         own = sampled[0] if len(sampled) == 1 else sampled.gather(0, particles.member[None])[0]
-        nothing = torch.zeros_like(particles.mass)
-        return particles.changed(exchange=torch.where(particles.inside, own.to(nothing), nothing))
-
-    def level(self, particles: Particles, wanted: Tensor) -> None:
-        """Add a constant for each member, so that together (members,), internal, comes in as is wanted."""
-        mass = torch.where(particles.inside, particles.mass, torch.zeros_like(particles.mass))
-        missing = (wanted - exchanged(self.carried(particles))) / particles.per_member(mass, "sum").clamp_min(1e-6)
-        self._rate = self._rate + missing.reshape(-1, *[1] * self.grid.dimension)
+        found = particles.changed(exchange=torch.where(inside, own.to(particles.mass), 0.0))
+        if self.wanted is None:
+            return found
+        area = particles.per_member(torch.where(inside, particles.mass, 0.0), "sum").clamp_min(1e-6)
+        missing = ((self.wanted - exchanged(found)) / area).index_select(0, particles.member)
+        return found.changed(exchange=torch.where(inside, found.exchange + missing, 0.0))
 
 
 def exchanged(particles: Particles) -> Tensor:
@@ -59,3 +68,13 @@ def exchanged(particles: Particles) -> Tensor:
         return torch.zeros(particles.members, dtype=particles.mass.dtype, device=particles.mass.device)
     passing = particles.mass * particles.exchange
     return particles.per_member(torch.where(particles.inside, passing, torch.zeros_like(passing)), "sum")
+
+
+def grown(particles: Particles, step: Tensor) -> Particles:
+    """Particles with what has come in through the plane in a step (N,), internal."""
+    assert particles.exchange is not None
+    mass = particles.mass * torch.where(particles.inside, particles.exchange * step, 0.0).exp()
+    within = mass.clamp(*_SIZES)
+    # one that has been larger or smaller all along is let back, but goes no farther
+    closer = (mass - within).abs() < (particles.mass - particles.mass.clamp(*_SIZES)).abs()
+    return particles.changed(mass=torch.where(closer, mass, within))
