@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import pickle
+import shutil
 import signal
 import sys
 import threading
@@ -28,7 +29,7 @@ def main(folder: Path, processes: int, rank: int) -> None:
     """Take part as process ``rank`` of so many; never returns."""
     for one in (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1):
         signal.signal(one, signal.SIG_IGN)
-    threading.Thread(target=_end_with_lead, daemon=True).start()
+    threading.Thread(target=_end_with_lead, args=(folder,), daemon=True).start()
     torch.set_num_threads(1)
     warnings.simplefilter("ignore")  # said by every process alike; what one task says is handed on with its result
     try:
@@ -50,10 +51,14 @@ def main(folder: Path, processes: int, rank: int) -> None:
         os._exit(1)
 
 
-def _end_with_lead() -> None:
-    """End this process when the other end of its standard input is closed, whatever it is at."""
+def _end_with_lead(folder: Path) -> None:
+    """End this process when the lead's end of its standard input is closed, whatever it is at.
+
+    The lead ends its workers before it closes anything: it was killed, and the folder is left to them.
+    """
     while os.read(0, 1):
         pass
+    shutil.rmtree(folder, ignore_errors=True)
     os._exit(1)
 
 
