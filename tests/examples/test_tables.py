@@ -19,11 +19,12 @@ GATHERED = {"trust.json"}  # by hand from runs of several scripts, each named in
 PAGES = ("README.md", "torchsph/**/*.md", "examples/**/*.md", "geometry/**/*.md", "regularize/**/*.md")
 
 
-def origins(content: dict) -> list[dict]:
-    """Of a table, or of each of its rows."""
-    if "from" in content:
-        return [content["from"]]
-    return [row["from"] for rows in content["rows"].values() for row in rows.values()]
+def origins(content: object) -> list[dict]:
+    """Of a table, and of those of its rows that say it themselves."""
+    if not isinstance(content, dict):
+        return []
+    own = [content["from"]] if isinstance(content.get("from"), dict) else []
+    return own + [each for name, inner in content.items() if name != "from" for each in origins(inner)]
 
 
 def old() -> list[str]:
@@ -40,7 +41,9 @@ def old() -> list[str]:
 def test_a_table_says_what_it_comes_from(file):
     if file.name in GATHERED:
         return
-    for made in origins(json.loads(file.read_text(encoding="utf-8"))):
+    found = origins(json.loads(file.read_text(encoding="utf-8")))
+    assert found, f"{file.name}: no provenance; write it by examples.provenance.write_table"
+    for made in found:
         assert re.fullmatch("[0-9a-f]{40}", made["commit"]) and made["sources"], file.name
         missing = [source for source in made["sources"] if not (ROOT / source).exists()]
         assert not missing, f"{file.name}: {missing}; the code has moved: make it again, or correct its sources"
