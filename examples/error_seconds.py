@@ -132,7 +132,10 @@ def panel(axis: Axes, points: list[Point], title: str, label: str) -> None:
         axis.plot([p.seconds for p in mine], [p.error for p in mine], "o", color=colour, label=group, markersize=5)
     best = front(points)
     axis.step([p.seconds for p in best], [p.error for p in best], "k-", where="post", linewidth=0.8, zorder=0)
-    for point in points if len(points) < 18 else best:
+    named = (
+        points if len(points) < 18 else [p for p, after in zip(best, [*best[1:], None], strict=True) if apart(p, after)]
+    )
+    for point in named:
         above = all(
             other is point or abs(other.error - point.error) > 0.01 or other.error < point.error for other in points
         )
@@ -144,6 +147,11 @@ def panel(axis: Axes, points: list[Point], title: str, label: str) -> None:
     axis.xaxis.set_minor_formatter(NullFormatter())
     axis.grid(which="both", alpha=0.25)
     axis.legend(fontsize=7, framealpha=0.5)
+
+
+def apart(point: Point, after: Point | None) -> bool:
+    """Whether the next point of a front leaves room for this one's name."""
+    return after is None or point.error - after.error > 0.02
 
 
 def inputs_hash() -> str:

@@ -199,7 +199,8 @@ def test_the_readme_shows_rivals_as_they_were_found():
     both = {name: [rows[noise].get(key) for noise in ("measured", "noisy")] for name, key in RIVALS.items()}
     expected = {name: pair for name, pair in both.items() if all(pair)}
     for name, (measured, noisy) in expected.items():
-        errors = " | ".join(short(row["nrmse"]) if row["nrmse"] < 1 else f"{row['nrmse']:.2f}" for row in (measured, noisy))
+        found = (measured["nrmse"], noisy["nrmse"])
+        errors = " | ".join(short(value) if value < 1 else f"{value:.2f}" for value in found)
         assert f"| {name} | {errors} | {measured['direction_error_deg']:.0f}° | " in page, name
     assert len(re.findall(r"^\| .* \| .*° \| ", page, re.MULTILINE)) == len(expected)
     words = page.replace("\n", " ")

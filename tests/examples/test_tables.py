@@ -13,18 +13,10 @@ from paths import ROOT
 if str(ROOT) not in sys.path:
     sys.path.append(str(ROOT))
 
-from examples.provenance import bare, code_hash, stale, tables, write_table
+from examples.provenance import bare, code_hash, origins, stale, tables, write_table
 
 GATHERED = {"trust.json"}  # by hand from runs of several scripts, each named inside
 PAGES = ("README.md", "torchsph/**/*.md", "examples/**/*.md", "geometry/**/*.md", "regularize/**/*.md")
-
-
-def origins(content: object) -> list[dict]:
-    """Of a table, and of those of its rows that say it themselves."""
-    if not isinstance(content, dict):
-        return []
-    own = [content["from"]] if isinstance(content.get("from"), dict) else []
-    return own + [each for name, inner in content.items() if name != "from" for each in origins(inner)]
 
 
 def old() -> list[str]:
