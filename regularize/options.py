@@ -25,7 +25,7 @@ from .basis.sampling import mean_length
 from .errors import InvalidInput
 from .solvers.interface import MOST_ITERATIONS
 from .solvers.registry import AUTO, SOLVERS
-from .statistics.likelihood import Choice
+from .statistics.likelihood import LEAST, MOST, Choice
 from .statistics.robust import CUTOFFS
 
 SCALINGS = ("density", "thesis")
@@ -36,7 +36,6 @@ SAMPLES_PER_KNOT, SAMPLES_OF_LOW_NOISE, LOW_NOISE = 3.0, 2.0, 0.2
 DIVERGENCE = 10.0  # knot distances
 CURVATURE = 3.0  # to a knot distance; the first guess of a search
 Length = float | Literal["auto"]
-LEAST, MOST = 1e-30, 1e30  # of a strength: its tenth power is still a number
 MOST_DISTANCE = 1e9  # m or s: beyond it products underflow
 LENGTHS = ("divergence", "curvature", "time_curvature")  # that a number of knots stands for
 AUTOMATIC = (None, "likelihood", "gcv")

@@ -150,16 +150,20 @@ def orifices(motion: WallMotion) -> list[Orifice]:
     return found
 
 
+_CURE = "label the faces of each opening alone, and those of the wall itself 0"
+
+
 def _rim_edges(faces: np.ndarray, label: int) -> np.ndarray:
     """Directed edges around a set of faces, in order (in a plane both ends, each as a pair with itself)."""
     if faces.shape[1] == 2:
         ends = np.setxor1d(faces[:, 0], faces[:, 1])
         if len(ends) != 2:
-            raise SurfaceError(f"region {label} has {len(ends)} ends in the plane; an opening has two")
+            rule = f"region {label} has {len(ends)} ends in the plane, but an opening has two"
+            raise SurfaceError(f"/wall/region: {rule}; {_CURE}")
         return np.stack([ends, ends], axis=1)
     loops = rims(faces)
     if not loops:
-        raise SurfaceError(f"region {label} has no rim: it covers a closed surface")
+        raise SurfaceError(f"/wall/region: region {label} has no rim, because it covers a closed surface; {_CURE}")
     return np.concatenate([np.column_stack([loop, np.roll(loop, -1)]) for loop in loops])
 
 

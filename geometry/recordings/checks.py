@@ -154,9 +154,13 @@ def _coverage(recording: Recording) -> Iterator[Finding]:
 
 
 def _regions(recording: Recording) -> Iterator[Finding]:
-    if recording.wall is None:
+    wall = recording.wall
+    if wall is None:
         return
-    present = set(np.unique(recording.wall.region).tolist())
+    present = set(np.unique(wall.region).tolist())
+    if 0 not in present:
+        rule = f"says that every face is an opening (regions {', '.join(map(str, sorted(present)))})"
+        yield Finding("/wall/region", rule, "give 0 to the faces of the wall itself")
     leak = () if recording.valve_leak is None else recording.valve_leak[:, 0].astype(int).tolist()
     named = [(flux.dataset, flux.region) for flux in recording.fluxes] + [("/valve/leak", region) for region in leak]
     for dataset, region in named:

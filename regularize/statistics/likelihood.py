@@ -28,6 +28,8 @@ from regularize.solvers.prepared import SHIFT, PreparedSystem
 
 from .robust import inflation, robust_weight
 
+LEAST, MOST = 1e-30, 1e30  # of a strength: its tenth power is still a number
+
 PROBES = 8  # random sums of rows per trace: its error is about sqrt(2 / (PROBES unknowns)), near 1 %
 RELAXATION = 1.6  # the plain update converges from one side at a rate near 0.6
 UNLIKE = 10.0  # no component is taken for more than this many times noisier than another
@@ -83,6 +85,15 @@ class Choice:
         stronger = {name: value and less * value for name, value in vars(self).items() if name in RATIOS}
         curvature = self.curvature * less ** (1.0 / self.order)
         return replace(self, curvature=curvature, shared=tuple(shared.tolist()), **stronger)
+
+
+def _strength(precision: float) -> float | None:
+    """A penalty's strength from its precision over the samples'; None where the data have switched it off.
+
+    A search that finds nothing for a penalty makes it weaker round by round, beyond what options and sums can hold.
+    """
+    strength = min(max(precision, 0.0) ** 0.5, MOST)
+    return strength if strength >= LEAST else None
 
 
 @dataclass(frozen=True)
@@ -225,7 +236,7 @@ class LikelihoodSearch:
                 found, steps = found._replace(rough=found.rough * exp(ahead)), []
         scale = self.scale(found.fit)
         noise_each = tuple((found.fit**-0.5).tolist())
-        no_slip, divergence = ((each / scale) ** 0.5 if each > 0 else None for each in (found.slip, found.divergence))
+        no_slip, divergence = (_strength(each / scale) for each in (found.slip, found.divergence))
         curvature = (found.rough / scale) ** (0.5 / self.groups.order)
         return Choice(noise_each, curvature, no_slip, divergence, self.groups.order, self.factor, count, settled)
 

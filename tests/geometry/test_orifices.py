@@ -124,7 +124,7 @@ def test_plane_openings_are_intervals() -> None:
 def test_regions_that_are_no_openings_are_refused() -> None:
     ball = ellipsoid((1.0, 1.0, 1.0), 0.4)
     closed = Surface(ball.vertices, ball.faces, np.ones(len(ball.faces)))
-    with pytest.raises(SurfaceError, match="region 1 has no rim"):
+    with pytest.raises(SurfaceError, match="/wall/region: region 1 has no rim"):
         orifices(WallMotion.at_rest(closed))
     assert orifices(WallMotion.at_rest(ball)) == []
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 
 from .exit_codes import ExitCode
 
 # what names the input, in the options of the commands
-_INPUTS = ("measurement", "recording", "analysis", "true", "file")
+_INPUTS = ("recording", "analysis", "true", "file", "measurement")
 _SAMPLE = "the sample"
 
 
@@ -23,15 +24,29 @@ def late_fault(fault: BaseException, code: ExitCode, args: argparse.Namespace | 
         One line; None for faults that say all of it themselves.
     """
     if code is ExitCode.MEMORY:
-        from torchsph.methods.memory import NotEnoughMemory  # here, because it brings torch along
+        # here, because they bring torch along
+        from torchsph.methods.memory import NotEnoughMemory
+        from torchsph.methods.runtime.workers import KilledWorker
 
-        if isinstance(fault, NotEnoughMemory):  # foretold: it says how much, and which of the settings is to blame
+        if isinstance(fault, NotEnoughMemory | KilledWorker):  # they say how much, or who, and what to do about it
             return f"{_about(args)}{fault}"
         return f"{_about(args)}out of memory; {_cure(args, _LESS) or 'close other programs, or use a larger machine'}"
     if code is ExitCode.NUMERICAL:
         cure = _cure(args, _CALMER)
         return f"{_about(args)}{str(fault).rstrip('.')}{f'; {cure}' if cure else ''}"
+    if code is ExitCode.INPUT and isinstance(fault, ValueError) and not _names_what_was_given(str(fault), args):
+        return f"{_about(args)}{fault}"
     return None
+
+
+def _names_what_was_given(text: str, args: argparse.Namespace | None) -> bool:
+    """Whether a message names a file or an option of the command."""
+    given = () if args is None else vars(args).values()
+    words = [word for value in given for word in (value if isinstance(value, list) else [value])]
+    paths = [word for word in words if isinstance(word, str) and word]
+    # a suffix tells a file from other words, such as "noise"
+    named = any(text.startswith(f"{path}: ") or (Path(path).suffix and path in text) for path in paths)
+    return named or "--" in text
 
 
 # option -> what to do with it

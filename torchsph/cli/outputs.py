@@ -19,7 +19,7 @@ import geometry
 from geometry.formats import write_sidecar
 from geometry.recordings.whole_file import move_together, refuse_special, write_whole, written_together
 
-__all__ = ["output_folder", "staged", "write_analysis", "write_json"]
+__all__ = ["output_folder", "staged", "write_analysis", "write_json", "write_result"]
 
 _SCRATCH = ".torchsph-"
 
@@ -82,16 +82,33 @@ def write_analysis(
     """
     path = Path(path)
     if not sidecar:
-        geometry.write_recording(path, recording, provenance=account)
+        write_result(path, recording, account)
         return
     for beside in ("", "_wall"):
         refuse_special(path.with_name(f"{path.stem}{beside}.vtkhdf"))
+    with written_together(path.parent) as scratch:
+        write_result(scratch / path.name, recording, account)
+        write_sidecar(scratch / path.name, recording)
+
+
+def write_result(path: Path, recording: geometry.Recording, account: Mapping[str, object]) -> None:
+    """Write a recording that was computed.
+
+    Args:
+        path: of the recording.
+        recording: the result.
+        account: where it comes from.
+
+    Raises:
+        NumericalFailure: it breaks a rule of recordings. The input did not, so that a cure for files does not help.
+    """
     try:
-        with written_together(path.parent) as scratch:
-            geometry.write_recording(scratch / path.name, recording, provenance=account)
-            write_sidecar(scratch / path.name, recording)
-    except geometry.RecordingError as fault:  # of the file that is wanted, not of the one on the way to it
-        raise geometry.RecordingError(str(path), fault.dataset, fault.rule) from fault
+        geometry.write_recording(path, recording, provenance=account)
+    except geometry.RecordingError as fault:
+        from torchsph.simulator.failures import NumericalFailure  # here, because it brings torch along
+
+        broken = fault.rule.partition(";")[0].partition(", so it is")[0]  # what follows are cures
+        raise NumericalFailure(f"what was computed is no flow: its {fault.dataset} {broken}") from fault
 
 
 def _locked_scratch(folder: Path) -> tuple[Path, int]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import csv
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 
 import geometry
 from torchsph.evaluation.frames import matching_frames
-from torchsph.evaluation.metrics import filled_velocity
+from torchsph.evaluation.metrics import filled_velocity, gaps
 from torchsph.haemodynamics.beat import BEAT_UNITS, beat_numbers
 from torchsph.haemodynamics.quantities import UNITS, FlowDomain, flow_quantities
 from torchsph.haemodynamics.uncertainty import Summary, coverage
@@ -36,6 +37,13 @@ CAUTION = (
 def plain_curves(recording: geometry.Recording) -> Curves:
     """The curves of one recording alone; the variance that an analysis claims is added to its kinetic energy."""
     sigma = recording.sigma if recording.weight is None else None  # of a measurement it is noise, not missing energy
+    missing = gaps(recording)
+    if missing.any():
+        part = f"{100 * missing.sum() / np.asarray(recording.mask, bool).sum():.3g} % of the nodes in the blood"
+        warnings.warn(
+            f"{part} carry no value and count as at rest, so that energies are too small; smooth or assimilate first",
+            stacklevel=2,
+        )
     return flow_quantities(FlowDomain.from_recording(recording), filled_velocity(recording), sigma=sigma)
 
 

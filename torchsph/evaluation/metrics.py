@@ -109,6 +109,14 @@ def filled_velocity(recording: geometry.Recording) -> np.ndarray:
     return np.where(known[:, None] & np.isfinite(velocity), velocity, 0)
 
 
+def gaps(recording: geometry.Recording) -> np.ndarray:
+    """(T, *shape) bool: nodes in the blood where the recording has no value: not finite, or of weight 0."""
+    unknown = ~np.isfinite(recording.velocity).all(axis=1)
+    if recording.weight is not None:
+        unknown |= ~(np.asarray(recording.weight) > 0)
+    return np.asarray(recording.mask, bool) & unknown
+
+
 # --- against the truth ----------------------------------------------------------------------------
 
 

@@ -31,7 +31,7 @@ import geometry
 from geometry.arguments import checked, finite
 from geometry.grids.fields import masked_blur
 from torchsph.evaluation.frames import SAME_TIME
-from torchsph.evaluation.metrics import filled_velocity
+from torchsph.evaluation.metrics import filled_velocity, gaps
 from torchsph.simulator.failures import NumericalFailure
 from torchsph.simulator.grid_forecast import GridForecast, Transfer
 from torchsph.simulator.simulator import Simulator
@@ -90,7 +90,7 @@ class BetweenFrames:
         failures: frames from which the model failed, with the reason; there the lines are straight, as a warning says.
 
     Raises:
-        ValueError: fewer than two frames, or a frame without blood.
+        ValueError: fewer than two frames, a frame without blood, or nodes in the blood without a value.
     """
 
     @checked
@@ -102,6 +102,11 @@ class BetweenFrames:
         self.masks = np.array(recording.mask, bool)
         if not self.masks.reshape(len(self.masks), -1).any(1).all():
             raise ValueError("BetweenFrames: a frame has no node in the blood")
+        missing = gaps(recording)
+        if missing.any():
+            first = int(np.argwhere(missing)[0, 0])
+            rule = f"nothing is known at {int(missing.sum())} nodes in the blood, first at frame {first}"
+            raise ValueError(f"BetweenFrames: {rule}; smooth or assimilate the measurement first")
         self.velocity = filled_velocity(recording).astype(np.float32)
         self.motion = None if recording.wall is None else geometry.WallMotion.from_recording(recording)
         self.failures: dict[int, str] = {}

@@ -170,6 +170,18 @@ def test_valves_that_open_without_frames_or_faces_are_told(sound: Recording) -> 
     assert "region 3, of which the wall has no face" in said(other)["/valve/intervals"]
 
 
+def test_a_wall_of_openings_alone_is_told(sound: Recording) -> None:
+    every = replace(sound, wall=replace(sound.wall, region=np.ones_like(sound.wall.region)))
+    (told,) = [one for one in findings(every) if one.dataset == "/wall/region"]
+    assert "every face is an opening (regions 1)" in str(told) and "give 0 to the faces of the wall itself" in str(told)
+
+
+def test_fluxes_and_volumes_that_overflow_are_refused(sound: Recording) -> None:
+    for name, dataset in (("flux_mitral", "/flux/mitral"), ("volume", "/volume")):
+        with pytest.raises(RecordingError, match=f"{dataset}: reaches 1.7e[+]308 m3.*ml times 1e-6"):
+            replace(sound, **{name: np.full(sound.frames, 1.7e308)}).check()
+
+
 def test_wrapped_speeds_are_told(box_recording: Callable[..., Recording]) -> None:
     def fast(points: np.ndarray, _: float) -> np.ndarray:
         return np.stack([np.zeros(len(points)), np.zeros(len(points)), 400 * (points[:, 0] - 0.005)], axis=1)

@@ -76,3 +76,9 @@ def test_knots_that_are_spread_out_cover_the_same_box():
         low, high = knots.origin[axis], knots.origin[axis] + 0.01 * (axis + 1) * knots.cells[axis]
         assert wide.origin[axis] <= low + 1e-12
         assert wide.origin[axis] + wide.spacing[axis] * wide.cells[axis] >= high - 1e-12
+
+
+def test_a_penalty_that_fades_is_off_and_never_beyond_what_options_hold():
+    assert likelihood._strength(0.0) is None and likelihood._strength(1e-106) is None
+    assert likelihood._strength(4.0) == 2.0 and likelihood._strength(1e300) == likelihood.MOST
+    regularize.Smoother(no_slip=likelihood._strength(likelihood.LEAST**2 * 1.0001), divergence=None)

@@ -41,10 +41,17 @@ def test_memory_and_numbers() -> None:
     )
     sample = argparse.Namespace(measurement=None, spacing=None)
     assert str(late_fault(failed, ExitCode.NUMERICAL, sample)).startswith("the sample: all 3")
-    assert late_fault(ValueError("x"), ExitCode.INPUT, FULL) is None
     assert late_fault(MemoryError(), ExitCode.MEMORY, None) == "out of memory; " + (
         "close other programs, or use a larger machine"
     )
+
+
+def test_a_fault_of_the_input_names_it() -> None:
+    assert late_fault(ValueError("a flow in a plane"), ExitCode.INPUT, FULL) == "m.h5: a flow in a plane"
+    for named in ("m.h5: /time: is missing", "--spacing: is too large", "also.h5: is a folder"):
+        args = argparse.Namespace(**vars(FULL), also=["also.h5"])
+        assert late_fault(ValueError(named), ExitCode.INPUT, args) is None
+    assert late_fault(ValueError("no such option"), ExitCode.INPUT, None) == "no such option"
 
 
 @pytest.mark.parametrize(("fault", "code"), [(MemoryError(), 3), (NumericalFailure("all failed"), 4)])

@@ -6,14 +6,18 @@ import json
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
+import geometry
 from torchsph.cli.main import main
-from torchsph.cli.outputs import output_folder, staged, write_json
+from torchsph.cli.outputs import output_folder, staged, write_analysis, write_json
 from torchsph.cli.terminal import printable
+from torchsph.data import sample_measurement
+from torchsph.simulator.failures import NumericalFailure
 
 
 def test_staged_files_arrive_together(tmp_path):
@@ -41,7 +45,7 @@ def test_staged_files_vanish_on_failure_and_others_stay(tmp_path):
 def test_the_scratch_folder_of_a_killed_run_is_swept_and_a_living_one_s_is_not(tmp_path):
     program = "import os, sys\nfrom torchsph.cli.outputs import staged\n"
     program += "with staged(sys.argv[1]) as scratch:\n    (scratch / 'one').touch()\n    os.kill(os.getpid(), 9)"
-    assert subprocess.run([sys.executable, "-c", program, str(tmp_path)]).returncode == -signal.SIGKILL
+    assert subprocess.run([sys.executable, "-c", program, str(tmp_path)], cwd=tmp_path).returncode == -signal.SIGKILL
     (dead,) = tmp_path.iterdir()
     (tmp_path / ".torchsph-link").symlink_to(tmp_path)
     with staged(tmp_path) as first, staged(tmp_path) as second:
@@ -110,3 +114,15 @@ def test_json_is_strict_and_plain(tmp_path):
         "device": "cpu",
         "5": 0.5,
     }
+
+
+def test_a_result_that_is_no_flow_is_a_numerical_fault_not_one_of_units(tmp_path):
+    good = geometry.read_recording(sample_measurement()).select(slice(0, 2))
+    runaway = replace(good, velocity=1e3 * good.velocity)
+    for sidecar in (False, True):
+        with pytest.raises(
+            NumericalFailure, match=r"what was computed is no flow: its /velocity reaches [\d.]+, above"
+        ) as told:
+            write_analysis(tmp_path / "a.h5", runaway, {}, sidecar=sidecar)
+        assert "convert" not in str(told.value) and "mm/s" not in str(told.value)
+    assert not list(tmp_path.iterdir())

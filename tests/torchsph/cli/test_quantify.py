@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from dataclasses import replace
 
 import numpy as np
 
@@ -40,3 +41,14 @@ def test_faults_are_one_line(tmp_path, capsys, box_recording):
     assert main(["quantify", str(tmp_path / "plane.h5"), "--out", str(tmp_path)]) == 2
     assert "in space" in capsys.readouterr().err
     assert not (tmp_path / "quantities.json").exists()
+
+
+def test_nodes_without_a_value_are_told(tmp_path, capsys, box_recording):
+    whole = box_recording(plug)
+    weight = np.array(whole.mask, np.float32)
+    weight[:, : weight.shape[1] // 2] = 0
+    for name, recording in (("whole", whole), ("half", replace(whole, weight=weight))):
+        geometry.write_recording(tmp_path / f"{name}.h5", recording)
+        assert main(["quantify", str(tmp_path / f"{name}.h5"), "--out", str(tmp_path)]) == 0
+        told = capsys.readouterr().err
+        assert ("of the nodes in the blood carry no value and count as at rest" in told) == (name == "half")

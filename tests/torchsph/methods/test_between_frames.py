@@ -189,6 +189,12 @@ def test_what_cannot_be_is_refused(box_recording):
         list(flow.moments([0.01, 0.0], recording.grid))
     with pytest.raises(ValueError, match="at least 2 frames"):
         BetweenFrames(recording.select([0]))
+    holes = np.array(recording.velocity)
+    holes[1, 0, np.array(recording.mask[1], bool)] = np.nan
+    weight = np.where(np.isfinite(holes).all(1), 1.0, 0.0).astype(np.float32)
+    for gap in (replace(recording, velocity=holes), replace(recording, weight=weight)):
+        with pytest.raises(ValueError, match="nothing is known at .* nodes in the blood, first at frame 1; smooth or"):
+            BetweenFrames(gap)
     with pytest.raises(ValueError, match="times must increase"):
         resample(recording, times=[0.01, 0.01])
     with pytest.raises(ValueError, match="it is in metres"):

@@ -17,6 +17,9 @@ from torch import Tensor
 
 from ..errors import AssimilationError
 
+# of which a taper takes about ten copies on its way: they stay in the cache, and small beside what they are summed to
+_TAPERS_AT_ONCE = 250_000
+
 
 def gaspari_cohn(distance: Tensor) -> Tensor:
     """The compactly supported correlation of Gaspari & Cohn (1999), QJRMS 125, eq. 4.10.
@@ -72,6 +75,10 @@ class Localisation:
 
     def taper(self, first: Tensor, second: Tensor) -> Tensor:
         """`(a, b)` weights between SCALED positions `(a, D)` and `(b, D)`."""
+        rows = max(1, _TAPERS_AT_ONCE // max(1, len(second)))
+        return torch.cat([self._taper(part, second) for part in first.split(rows)])
+
+    def _taper(self, first: Tensor, second: Tensor) -> Tensor:
         if self.period is None:
             return gaspari_cohn(torch.cdist(first, second, compute_mode="donot_use_mm_for_euclid_dist"))
         period = self.scaled_period(first.shape[-1], first.device)

@@ -14,6 +14,7 @@ from torchsph.simulator.schemes.presets import PRESETS
 from ..arguments import add_seed, number
 from ..checks import check_spacing, full_vectors, output_file, usable_device
 from ..command import Command
+from ..outputs import write_result
 from ..printing import say
 from ..running.notes import shows_bar
 from ..running.provenance import provenance
@@ -55,7 +56,7 @@ def run(args: argparse.Namespace) -> None:
         check_spacing(args.particles, analysis)
         model = make_model(analysis, preset=args.preset, spacing=args.particles, device=usable_device(args.device))
     found = resample(analysis, model, times=times, spacing=args.spacing, seed=args.seed, progress=shows_bar(args))
-    geometry.write_recording(path, found, provenance=provenance(args, {"analysis": args.analysis}))
+    write_result(path, found, provenance(args, {"analysis": args.analysis}))
     say(f"wrote {found.frames} frames on {' x '.join(str(n) for n in reversed(found.grid.shape))} nodes to {path}")
 
 

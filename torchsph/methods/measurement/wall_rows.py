@@ -12,6 +12,8 @@ from regularize import WallRows
 POINTS_PER_KNOT = 4  # on the wall, along a knot distance
 MANY = 4  # times as many faces as such points are worth replacing
 FEWEST = 1000  # points below which it saves nothing
+# openings of one label that face apart cancel: below this part of their area, they pass no plug together
+FACING = 0.4
 
 
 def open_regions(recording: geometry.Recording, time: float) -> tuple[int, ...]:
@@ -22,6 +24,30 @@ def open_regions(recording: geometry.Recording, time: float) -> tuple[int, ...]:
         passing |= {int(r) for r, part in recording.valve_leak if part > 0}
     present = np.unique(recording.wall_for("open orifices").region).tolist()
     return tuple(sorted(passing & set(present)))
+
+
+def open_together(
+    recording: geometry.Recording, motion: geometry.WallMotion, frame: int, contradicted: bool
+) -> tuple[int, ...]:
+    """Regions at a frame whose fluxes are for the data to say: several, or velocities contradict the walls.
+
+    Openings that face apart are several, also where they share a label.
+    """
+    time = float(recording.time[frame])
+    regions = open_regions(recording, time)
+    if len(regions) == 1 and not contradicted:
+        return () if faces_one_way(motion.surface(time), regions[0]) else regions
+    return regions
+
+
+def faces_one_way(surface: geometry.Surface, region: int) -> bool:
+    """Whether a region's faces look in about one direction, so that one plug can pass them.
+
+    Two openings at opposite ends that share a label do not: their area vectors cancel.
+    """
+    part = surface.part(region)
+    vector = surface.area_vectors[part].sum(0)
+    return float(np.linalg.norm(vector)) >= FACING * float(surface.areas[part].sum())
 
 
 def at_knots(motion: geometry.WallMotion, knots: float) -> tuple[geometry.WallMotion, geometry.WallSampler | None]:
@@ -58,8 +84,9 @@ def wall_rows(
     changes by over sigma, so that its rows weigh 1 / (1 + (sigma / knots)^2) times as much beside the others; what that
     makes of all of them is ``mean_certainty``.
 
-    An orifice that alone is open carries the flux dV/dt as a plug. Where several are open, how they share it is for the
-    data to say: they have no rows, and that their fluxes sum to dV/dt is an equation of its own (``flux_data``).
+    An orifice that alone is open carries the flux dV/dt as a plug. Where several are open, or one label names openings
+    that face apart, how they share it is for the data to say: they have no rows, and that their fluxes sum to dV/dt is
+    an equation of its own (``flux_data``).
 
     Args:
         recording: whose frame and valves it is.
@@ -78,7 +105,7 @@ def wall_rows(
     else:
         points = sampler.at(time)
     velocity, regions = points.velocities, open_regions(recording, time)
-    plug = len(regions) == 1 and not free
+    plug = len(regions) == 1 and not free and faces_one_way(surface, regions[0])
     if plug:
         vector = surface.area_vectors[surface.part(regions[0])].sum(0)
         area = float(np.linalg.norm(vector))

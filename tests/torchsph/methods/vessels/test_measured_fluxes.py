@@ -126,3 +126,17 @@ def test_a_valve_that_leaks_shares_by_what_stays_open_and_has_no_rows():
 def test_errors_that_cannot_be_are_refused(fields, rule):
     with pytest.raises(ValueError, match=rule):
         Valve(1, ALWAYS, **fields)
+
+
+def test_both_ends_under_one_label_are_two_openings():
+    """Their area vectors cancel: one plug for both would be without bounds (1e13 m/s where walls move)."""
+    apart = noisy_tube()
+    region = np.minimum(apart.wall.region, 1)
+    together = replace(apart, wall=replace(apart.wall, region=region), valve_intervals=np.array([[1.0, -1.0, 1.0]]))
+    fields = []
+    for one in (apart, together):
+        frames = FrameSmoother(one, Smoother().fixed(curvature=1e-3))
+        rows = wall_rows(one, frames.motion, 0)
+        assert bool((rows.velocity == 0).all()) and len(rows.points) == int((one.wall.region == 0).sum())
+        fields.append(frames.fit(0)(frames.nodes[torch.from_numpy(one.mask[0].reshape(-1))]))
+    assert torch.equal(*fields)
