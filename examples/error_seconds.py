@@ -124,22 +124,34 @@ def front(points: list[Point]) -> list[Point]:
 
 
 def panel(axis: Axes, points: list[Point], title: str, label: str) -> None:
-    """Points with their names, a colour for each group, and the front."""
+    """Points with the names of those of the front and, where there are few, of all; a colour for each group."""
     groups = list(dict.fromkeys(point.group for point in points))
     for number, group in enumerate(groups):
         mine = [point for point in points if point.group == group]
-        axis.plot(
-            [p.seconds for p in mine], [p.error for p in mine], "o", color=f"C{number}", label=group, markersize=5
-        )
+        colour = f"C{number}"
+        axis.plot([p.seconds for p in mine], [p.error for p in mine], "o", color=colour, label=group, markersize=5)
     best = front(points)
     axis.step([p.seconds for p in best], [p.error for p in best], "k-", where="post", linewidth=0.8, zorder=0)
-    for point in points if len(points) < 16 else best:
-        axis.annotate(point.name, (point.seconds, point.error), (4, 3), textcoords="offset points", fontsize=7)
-    axis.set(xscale="log", xlabel="seconds", ylabel=label, title=title)
+    named = (
+        points if len(points) < 18 else [p for p, after in zip(best, [*best[1:], None], strict=True) if apart(p, after)]
+    )
+    for point in named:
+        above = all(
+            other is point or abs(other.error - point.error) > 0.01 or other.error < point.error for other in points
+        )
+        name = point.name.removeprefix(f"{point.group}, ")
+        place, side = ((4, 3), "bottom") if above else ((4, -3), "top")
+        axis.annotate(name, (point.seconds, point.error), place, textcoords="offset points", fontsize=7, va=side)
+    axis.set(xscale="log", xlabel="CPU seconds", ylabel=label, title=title)
     axis.margins(x=0.25, y=0.1)
     axis.xaxis.set_minor_formatter(NullFormatter())
     axis.grid(which="both", alpha=0.25)
     axis.legend(fontsize=7, framealpha=0.5)
+
+
+def apart(point: Point, after: Point | None) -> bool:
+    """Whether the next point of a front leaves room for this one's name."""
+    return after is None or point.error - after.error > 0.02
 
 
 def inputs_hash() -> str:

@@ -133,16 +133,22 @@ def tables() -> list[Path]:
     return sorted((ROOT / "examples").glob("*/results/*.json"))
 
 
+def origins(content: object) -> list[dict[str, Any]]:
+    """Where a table comes from, and those of its rows that say it themselves."""
+    if not isinstance(content, dict):
+        return []
+    own = [content["from"]] if isinstance(content.get("from"), dict) else []
+    return own + [each for name, inner in content.items() if name != "from" for each in origins(inner)]
+
+
 def main() -> int:
     """Print the list; 0 whatever it says."""
     for file in tables():
-        made = json.loads(file.read_text(encoding="utf-8")).get("from")
-        if made is None:
-            state = "       no provenance"
-        else:
-            old = "older" if stale({"from": made}) else "current"
-            state = f"{made['commit'][:8]:9s}{old:9s}{made.get('command', '')}"
-        print(f"{file.relative_to(ROOT / 'examples').as_posix():52s}{state}")
+        found = origins(json.loads(file.read_text(encoding="utf-8")))
+        old = sum(stale({"from": made}) for made in found)
+        state = "no provenance" if not found else "current" if not old else f"older, {old} of {len(found)}"
+        commit, made = (found[0]["commit"][:8], found[0].get("command", "")) if found else ("", "")
+        print(f"{file.relative_to(ROOT / 'examples').as_posix():52s}{commit:9s}{state:15s}{made}")
     return 0
 
 

@@ -28,9 +28,10 @@ from filter_sweeps import around_the_fastest, averaged
 import geometry
 from examples.provenance import ANALYSES, write_table
 from torchsph.evaluation.metrics import METRICS, evaluate, filled_velocity, spread_over_skill
-from torchsph.methods import by_name
+from torchsph.methods import methods_run
 from torchsph.methods.by_name import run_methods
 from torchsph.methods.measurement.prepared import PreparedMeasurement
+from torchsph.methods.models import ANALYSIS_SPACING, make_model
 from torchsph.methods.nudging import filter_sph
 
 SOURCES = ("examples/benchmarks/filter_methods.py", *ANALYSES)
@@ -81,7 +82,7 @@ def left(measured: geometry.Recording, truth: geometry.Recording, folder: Path, 
     }
     began = time.process_time()
     prepared = PreparedMeasurement(measured, smoothed=rows["spline"][0])
-    model = by_name.make_model(measured, spacing=by_name.ANALYSIS_SPACING * min(measured.grid.spacing))
+    model = make_model(measured, spacing=ANALYSIS_SPACING * min(measured.grid.spacing))
     run = filter_sph(prepared, model, seed=seed)
     return rows | {"sph": (run.recording, seconds["spline"] + time.process_time() - began)}
 
@@ -112,7 +113,7 @@ def main() -> None:
     parser.add_argument("--json", type=Path, help="also write the table here")
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
-    by_name.clock = ProcessorClock
+    methods_run.clock = ProcessorClock
     truth, measured = (geometry.read_recording(file) for file in (options.truth, options.measured))
     if options.quick:
         truth = around_the_fastest(truth)

@@ -175,3 +175,35 @@ def test_what_to_believe_is_what_was_measured():
         field = table["fields"]["pressure"]
         shown = [cells([field[source]]) if source in field else "" for source in (*sources, "simulator")]
         assert f"| {prefix}field, mean removed | {' | '.join(shown)} |" in page
+
+
+RIVALS = {
+    "**ensemble**, the default": "ensemble",
+    "**splines**, frame by frame": "spline",
+    "Helmholtz-Leray projection, averaged over time": "leray over time",
+    "Gaussian in space and time": "gaussian over time",
+    "constrained least squares, as iVFM has it": "ivfm",
+    "the same, averaged over time": "ivfm over time",
+    "neural field, a curl (SIREN)": "siren",
+    "physics-informed network": "pinn",
+    "learned denoiser": "denoiser",
+    "Helmholtz-Leray projection": "leray",
+    "`smoothn`, as PyMUST has it": "smoothn",
+    "Gaussian": "gaussian",
+    "the measurement": "raw",
+}
+
+
+def test_the_readme_shows_rivals_as_they_were_found():
+    page, rows = text("README.md"), json.loads(text("examples/rivals/results/rivals.json"))["rows"]
+    both = {name: [rows[noise].get(key) for noise in ("measured", "noisy")] for name, key in RIVALS.items()}
+    expected = {name: pair for name, pair in both.items() if all(pair)}
+    for name, (measured, noisy) in expected.items():
+        found = (measured["nrmse"], noisy["nrmse"])
+        errors = " | ".join(short(value) if value < 1 else f"{value:.2f}" for value in found)
+        assert f"| {name} | {errors} | {measured['direction_error_deg']:.0f}° | " in page, name
+    assert len(re.findall(r"^\| .* \| .*° \| ", page, re.MULTILINE)) == len(expected)
+    words = page.replace("\n", " ")
+    for noise, said in (("measured", "from {} (splines) to {}"), ("noisy", "from {} to {} at twice the noise")):
+        pair = (f"{rows[noise][method]['nrmse']:.2f}".removeprefix("0") for method in ("spline", "ensemble"))
+        assert said.format(*pair) in words

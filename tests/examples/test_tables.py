@@ -13,17 +13,10 @@ from paths import ROOT
 if str(ROOT) not in sys.path:
     sys.path.append(str(ROOT))
 
-from examples.provenance import bare, code_hash, stale, tables, write_table
+from examples.provenance import bare, code_hash, origins, stale, tables, write_table
 
 GATHERED = {"trust.json"}  # by hand from runs of several scripts, each named inside
 PAGES = ("README.md", "torchsph/**/*.md", "examples/**/*.md", "geometry/**/*.md", "regularize/**/*.md")
-
-
-def origins(content: dict) -> list[dict]:
-    """Of a table, or of each of its rows."""
-    if "from" in content:
-        return [content["from"]]
-    return [row["from"] for rows in content["rows"].values() for row in rows.values()]
 
 
 def old() -> list[str]:
@@ -40,7 +33,9 @@ def old() -> list[str]:
 def test_a_table_says_what_it_comes_from(file):
     if file.name in GATHERED:
         return
-    for made in origins(json.loads(file.read_text(encoding="utf-8"))):
+    found = origins(json.loads(file.read_text(encoding="utf-8")))
+    assert found, f"{file.name}: no provenance; write it by examples.provenance.write_table"
+    for made in found:
         assert re.fullmatch("[0-9a-f]{40}", made["commit"]) and made["sources"], file.name
         missing = [source for source in made["sources"] if not (ROOT / source).exists()]
         assert not missing, f"{file.name}: {missing}; the code has moved: make it again, or correct its sources"

@@ -41,7 +41,7 @@ __all__ = [
 ]
 
 # Written to analysis.h5 and run when no method is named: the one that wins on a CFD phantom in every case tried. RMS
-# error of the ensemble over that of the splines: .81 and .76 over the beat at two noise levels; over 200 ms of ejection
+# error of the ensemble over that of the splines: .80 and .75 over the beat at two noise levels; over 200 ms of ejection
 # and filling .84, .75, .68 and .67 at 25, 50, 100 and 200 Hz, .69 and .66 at half and double noise, .69 with a weight
 # that says nothing, .71 with one Doppler component (filter_*.json in examples/benchmarks/results).
 DEFAULT_METHOD = "ensemble"

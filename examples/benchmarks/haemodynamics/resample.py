@@ -1,14 +1,15 @@
 """The flow halfway between frames: by the model, and by straight and cubic lines in time.
 
     python examples/benchmarks/haemodynamics/resample.py TRUTH.h5 MEASURED.h5 [--every 2] [--particles M] [--members N]
-        [--run FOLDER] [--only NAME ...]
+        [--run FOLDER] [--between S S] [--only NAME ...]
 
 Takes every `every`-th frame of the measurement, and compares what lies halfway between two of them with the true flow:
 
 - `truth`: from the true flow at those frames, so that nothing but what lies in between is wrong;
 - `spline`: from the splines of the measured frames;
 - `ensemble`: from the analyses of the measured frames (with --members);
-- `analysis`: from the analysis of all frames that `torchsph assimilate` has left in a folder (with --run).
+- `analysis`: from the analysis of all frames that `torchsph assimilate` has left in a folder (with --run), or of those
+  between two times.
 
 `nrmse` is over all moments halfway, `ratio` that of the model over the straight line's, `spread` the claimed deviation
 over the error, both as root mean squares, `holds` the share of true velocity components within 1.645 claimed
@@ -106,6 +107,7 @@ def main() -> None:
     parser.add_argument("--particles", type=float, nargs="*", default=[], help="further spacings of particles, m")
     parser.add_argument("--members", type=int, default=0, help="of the ensemble; 0: no ensemble")
     parser.add_argument("--run", type=Path, help="folder with an analysis of all frames")
+    parser.add_argument("--between", type=float, nargs=2, metavar="S", help="of the analysis's frames these alone")
     parser.add_argument("--only", nargs="*", choices=("truth", "spline", "ensemble", "analysis"), help="these alone")
     parser.add_argument("--out", type=Path, default=RESULTS / "resample.json")
     args = parser.parse_args()
@@ -131,8 +133,9 @@ def main() -> None:
         note(f"ensemble of {args.members}", halfway(done.recording, truth, step))
     if args.run and "analysis" in wanted:
         whole = geometry.read_recording(args.run / "ensemble.h5")
-        within = 0.5 * (whole.time[1:] + whole.time[:-1]) < truth.time[-1] + 1e-6
-        note("analysis of all frames", halfway(whole.select(slice(0, int(within.sum()) + 1)), truth, step))
+        first, last = args.between or whole.time[[0, -1]]
+        kept = whole.select((whole.time > first - 1e-6) & (whole.time < last + 1e-6))
+        note(f"analysis, {1e3 * first:.0f} to {1e3 * last:.0f} ms", halfway(kept, truth, step))
 
 
 if __name__ == "__main__":
