@@ -189,9 +189,9 @@ def _runs(loop: _Loop) -> list[tuple[int, _Loop]]:
         loop = loop.rolled(first)
         change = np.zeros(1, int)
     else:
-        openings = [k for k in change if loop.region[k] > 0]
+        openings = [int(k) for k in change if loop.region[k] > 0]
         first = min(openings, key=lambda k: loop.region[k])
-        loop, change = loop.rolled(int(first)), np.sort((change - first) % len(loop.region))
+        loop, change = loop.rolled(first), np.sort((change - first) % len(loop.region))
     ends = [*change[1:].tolist(), len(loop.region)]
     closed = _Loop(*(np.concatenate([part, part[:1]]) for part in (loop.points, loop.velocity, loop.region)))
     return [

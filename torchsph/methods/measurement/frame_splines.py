@@ -73,8 +73,7 @@ class FrameSmoother:
             smoother = smoother.fixed()  # there is no automatic choice from components alone
         if smoother.spacing is None:
             smoother = replace(smoother, spacing=recording.grid.spacing)
-        if recording.cut and smoother.divergence == BY_DATA:
-            smoother = replace(smoother, divergence=OF_A_CUT * max(smoother.knots_at(recording.grid.spacing)))
+        smoother = _for_the_plane(smoother, recording)
         self.motion: geometry.WallMotion | None = None
         self._sampler: geometry.WallSampler | None = None
         if recording.wall is not None:
@@ -310,6 +309,13 @@ def _middle(frames: FrameSmoother, group: int) -> int | None:
     members = range(first, min(first + frames.choose_every, frames.recording.frames))
     from_middle = sorted(members, key=lambda k: abs(k - first - frames.choose_every // 2))
     return next((k for k in from_middle if frames.measures(k)), None)
+
+
+def _for_the_plane(smoother: regularize.Smoother, recording: geometry.Recording) -> regularize.Smoother:
+    """The smoother with as much divergence as a plane cut out of a flow has, where it is for us to say."""
+    if not recording.cut or smoother.divergence != BY_DATA:
+        return smoother
+    return replace(smoother, divergence=OF_A_CUT * max(smoother.knots_at(recording.grid.spacing)))
 
 
 def _motion(recording: geometry.Recording) -> geometry.WallMotion:

@@ -54,12 +54,13 @@ class Exchange:
         inside = particles.inside
         sampled = self.grid.sample(self._rate, particles.position * self.units.length)
         own = sampled[0] if len(sampled) == 1 else sampled.gather(0, particles.member[None])[0]
-        found = particles.changed(exchange=torch.where(inside, own.to(particles.mass), 0.0))
+        rate = torch.where(inside, own.to(particles.mass), 0.0)
+        found = particles.changed(exchange=rate)
         if self.wanted is None:
             return found
         area = particles.per_member(torch.where(inside, particles.mass, 0.0), "sum").clamp_min(1e-6)
         missing = ((self.wanted - exchanged(found)) / area).index_select(0, particles.member)
-        return found.changed(exchange=torch.where(inside, found.exchange + missing, 0.0))
+        return found.changed(exchange=torch.where(inside, rate + missing, 0.0))
 
 
 def exchanged(particles: Particles) -> Tensor:
