@@ -3,10 +3,10 @@
     python examples/error_seconds.py [--measure] [--out error_seconds.png]
 
 Drawn from results that are in the checkout: `benchmarks/results/speed_error.json` (schemes and steps),
-`filter_methods_*.json` (methods of torchsph), `spline_phantom.json`, `rivals/results/rivals.json` and, for presets,
-spacings, precisions and backends, `error_seconds.json` beside it, which `--measure` makes: row by row, those that are
-there already are kept. A black line joins what nothing else beats in error and seconds at once (the Pareto front).
-Seconds are CPU seconds of one thread; of the methods wall seconds of a shared machine, an upper bound.
+`filter_methods_*.json` (methods of torchsph), `rivals/results/rivals.json` and, for presets, spacings, precisions and
+backends, `error_seconds.json` beside them, which `--measure` makes: row by row, those that the present code has made
+are kept. A black line joins what nothing else beats in error and seconds at once (the Pareto front). Seconds are CPU
+seconds of one thread.
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ from matplotlib.ticker import NullFormatter
 
 import geometry
 import torchsph as ts
+from examples.provenance import MODEL, stale, write_table
 from torchsph.data import sample_truth
 
 HERE = Path(__file__).resolve().parent
@@ -40,10 +41,10 @@ INPUTS = (
     RESULTS / "speed_error.json",
     RESULTS / "filter_methods_measured.json",
     RESULTS / "filter_methods_noisy.json",
-    RESULTS / "spline_phantom.json",
     OWN,
     RIVALS,
 )
+SOURCES = ("examples/error_seconds.py", "torchsph/methods/forecast_skill.py", *MODEL)
 LEADS = (0.01, 0.02, 0.04)  # s
 ROWS = {  # name -> preset, spacing (mm), precision, backend
     "default, 3 mm": ("default", 3.0, torch.float32, "auto"),
@@ -77,13 +78,19 @@ def measured(preset: str, spacing: float, dtype: torch.dtype, backend: str) -> d
     return {"error": sum(ratios) / len(ratios), "cpu_s": time.process_time() - began}
 
 
+def own_rows() -> dict[str, dict[str, float]]:
+    """The rows that `--measure` has made."""
+    return json.loads(OWN.read_text(encoding="utf-8"))["rows"] if OWN.is_file() else {}
+
+
 def measure() -> None:
-    """Make the rows that are missing."""
-    rows = json.loads(OWN.read_text(encoding="utf-8")) if OWN.is_file() else {}
+    """Make the rows that are missing, all of them where code has changed since."""
+    current = OWN.is_file() and not stale(json.loads(OWN.read_text(encoding="utf-8")))
+    rows = own_rows() if current else {}
     for name, options in ROWS.items():
         if name not in rows:
             rows[name] = measured(*options)
-            OWN.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+            write_table(OWN, {"rows": rows}, SOURCES)
             print(f"{name}: {rows[name]['error']:.3f} in {rows[name]['cpu_s']:.1f} s", file=sys.stderr)
 
 
@@ -94,21 +101,17 @@ def forecasts() -> list[Point]:
         for row in json.loads(INPUTS[0].read_text(encoding="utf-8"))["rows"]
         if row["flow"] == "ventricle"
     ]
-    own = json.loads(OWN.read_text(encoding="utf-8")) if OWN.is_file() else {}
-    return points + [Point(name, row["cpu_s"], row["error"], name.split(",")[0]) for name, row in own.items()]
+    return points + [Point(name, row["cpu_s"], row["error"], name.split(",")[0]) for name, row in own_rows().items()]
 
 
 def analyses(noise: str) -> list[Point]:
-    """Points of a panel for one level of noise: methods of torchsph, a Gaussian, rivals."""
-    file = f"lv_phantom_a_{noise}"
-    table = json.loads((RESULTS / f"filter_methods_{noise}.json").read_text(encoding="utf-8"))["measurements"][file]
+    """Points of a panel for one level of noise: methods of torchsph, and rivals."""
+    table = json.loads((RESULTS / f"filter_methods_{noise}.json").read_text(encoding="utf-8"))["rows"]
     left_out = ("raw", "raw over time", "spline over time")  # no seconds of their own
-    points = [
-        Point(name, row["seconds"], row["nrmse"], "torchsph") for name, row in table.items() if name not in left_out
-    ]
-    rivals = json.loads(RIVALS.read_text(encoding="utf-8"))["rows"] if RIVALS.is_file() else {}
-    found = rivals.get(noise, {})
-    return points + [Point(name, row["seconds"], row["nrmse"], "rival") for name, row in found.items()]
+    own = [Point(name, row["seconds"], row["nrmse"], "torchsph") for name, row in table.items() if name not in left_out]
+    rows = json.loads(RIVALS.read_text(encoding="utf-8"))["rows"].get(noise, {}) if RIVALS.is_file() else {}
+    others = {name: row for name, row in rows.items() if name not in ("raw", "spline", "ensemble")}
+    return own + [Point(name, row["seconds"], row["nrmse"], "rival") for name, row in others.items()]
 
 
 def front(points: list[Point]) -> list[Point]:
@@ -121,22 +124,34 @@ def front(points: list[Point]) -> list[Point]:
 
 
 def panel(axis: Axes, points: list[Point], title: str, label: str) -> None:
-    """Points with their names, a colour for each group, and the front."""
+    """Points with the names of those of the front and, where there are few, of all; a colour for each group."""
     groups = list(dict.fromkeys(point.group for point in points))
     for number, group in enumerate(groups):
         mine = [point for point in points if point.group == group]
-        axis.plot(
-            [p.seconds for p in mine], [p.error for p in mine], "o", color=f"C{number}", label=group, markersize=5
-        )
+        colour = f"C{number}"
+        axis.plot([p.seconds for p in mine], [p.error for p in mine], "o", color=colour, label=group, markersize=5)
     best = front(points)
     axis.step([p.seconds for p in best], [p.error for p in best], "k-", where="post", linewidth=0.8, zorder=0)
-    for point in points if len(points) < 16 else best:
-        axis.annotate(point.name, (point.seconds, point.error), (4, 3), textcoords="offset points", fontsize=7)
-    axis.set(xscale="log", xlabel="seconds", ylabel=label, title=title)
+    named = (
+        points if len(points) < 18 else [p for p, after in zip(best, [*best[1:], None], strict=True) if apart(p, after)]
+    )
+    for point in named:
+        above = all(
+            other is point or abs(other.error - point.error) > 0.01 or other.error < point.error for other in points
+        )
+        name = point.name.removeprefix(f"{point.group}, ")
+        place, side = ((4, 3), "bottom") if above else ((4, -3), "top")
+        axis.annotate(name, (point.seconds, point.error), place, textcoords="offset points", fontsize=7, va=side)
+    axis.set(xscale="log", xlabel="CPU seconds", ylabel=label, title=title)
     axis.margins(x=0.25, y=0.1)
     axis.xaxis.set_minor_formatter(NullFormatter())
     axis.grid(which="both", alpha=0.25)
     axis.legend(fontsize=7, framealpha=0.5)
+
+
+def apart(point: Point, after: Point | None) -> bool:
+    """Whether the next point of a front leaves room for this one's name."""
+    return after is None or point.error - after.error > 0.02
 
 
 def inputs_hash() -> str:

@@ -1,9 +1,11 @@
 """Recordings, regular grids, closed surfaces and their signed distance, moving walls, ventricle shapes."""
 
 from .grids.grid import Grid, Stencil
+from .grids.unwrapping import unwrap
 from .motion.estimates import Estimates, estimated
 from .motion.moving_distance import MovingDistance, WallField, WallPoint
 from .motion.orifices import Orifice, OrificePlane, orifices
+from .motion.plane_cut import plane_cut
 from .motion.refine import refined, refined_motion
 from .motion.valve_times import ValveTimes, find_valve_times
 from .motion.wall_estimate import WallEstimate, estimate_wall
@@ -73,6 +75,7 @@ __all__ = [
     "measurement_type",
     "openings",
     "orifices",
+    "plane_cut",
     "polygon",
     "read_provenance",
     "read_recording",
@@ -87,6 +90,7 @@ __all__ = [
     "surface_from_velocity",
     "taubin",
     "tube",
+    "unwrap",
     "wall_points",
     "winding_number",
     "with_lids",

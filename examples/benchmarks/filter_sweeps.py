@@ -28,11 +28,14 @@ import numpy as np
 import torch
 
 import geometry
+from examples.provenance import ANALYSES, write_table
 from torchsph import assimilate, make_model
 from torchsph.evaluation.metrics import evaluate, spread_over_skill
 from torchsph.methods.free_run import run_freely
 from torchsph.methods.measurement.prepared import PreparedMeasurement
 from torchsph.ultrasound import NoiseModel, measure_noise
+
+SOURCES = ("examples/benchmarks/filter_sweeps.py", "torchsph/ultrasound", *ANALYSES)
 
 MEMBERS = 16
 BLUR = 10e-3  # s, deviation of the average over time
@@ -186,7 +189,7 @@ def main() -> None:
         )
         if options.json:  # after each case: a long sweep may be stopped
             about = {"seconds_of_flow": truth.time[[0, -1]].tolist(), "threads": options.threads, "seed": options.seed}
-            options.json.write_text(json.dumps(about | {"rows": rows}, indent=1) + "\n")
+            write_table(options.json, about | {"rows": rows}, SOURCES)
     if options.figure:
         draw(rows, options.figure)
 

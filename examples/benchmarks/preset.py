@@ -59,7 +59,6 @@ fields; the incompressible scheme takes three quarters of the time, is better af
 """
 
 import argparse
-import json
 import math
 import os
 import sys
@@ -71,6 +70,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 import torch
 
 import geometry
+from examples.provenance import MODEL, write_table
 from torchsph import (
     XSPH,
     CompleteKernelWall,
@@ -89,6 +89,8 @@ from torchsph import (
 from torchsph.data import sample_truth
 from torchsph.simulator.schemes.scheme import Scheme
 from torchsph.validation.runs import taylor_green, taylor_green_error
+
+SOURCES = ("examples/benchmarks/preset.py", "torchsph/methods/forecast_skill.py", *MODEL)
 
 LEADS = (0.01, 0.04)  # s
 DECAY_TIME = 100 / (8 * math.pi**2)
@@ -224,7 +226,7 @@ def main() -> None:
             "every": options.every,
             "load": os.getloadavg()[0],
         }
-        options.json.write_text(json.dumps(report, indent=1) + "\n")
+        write_table(options.json, report, SOURCES)
 
 
 if __name__ == "__main__":

@@ -23,8 +23,11 @@ from damage import CASES
 from spline_phantom import gaussian
 
 import geometry
+from examples.provenance import ANALYSES, write_table
 from torchsph.evaluation.metrics import evaluate, filled_velocity, spread_over_skill
 from torchsph.methods.by_name import run_methods
+
+SOURCES = ("examples/benchmarks/robustness.py", "examples/benchmarks/damage.py", *ANALYSES)
 
 METHODS = ("spline", "ensemble")
 
@@ -88,7 +91,7 @@ def main() -> None:
         show({case: rows[case]})
         if options.json:
             about = {"measurement": options.measured.name, "seed": options.seed}
-            options.json.write_text(json.dumps(about | {"cases": rows}, indent=1) + "\n")
+            write_table(options.json, about | {"cases": rows}, SOURCES)
     show(rows)
 
 

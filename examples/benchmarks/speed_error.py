@@ -35,7 +35,6 @@ The default preset is therefore the projection. PySPH's vortex: peers_vortex.py.
 """
 
 import argparse
-import json
 import math
 import os
 import sys
@@ -51,12 +50,15 @@ import torch
 from walls import steady_pipe
 
 import geometry
+from examples.provenance import MODEL, write_table
 from torchsph import GammaRamp, PotentialWall, Projection, Scene, Simulator, WeaklyCompressible, preset, skill
 from torchsph.data import sample_truth
 from torchsph.simulator.schemes.scheme import Scheme
 from torchsph.validation import exact_flows as validation
 from torchsph.validation.ellipsoid import PulsatingEllipsoid
 from torchsph.validation.runs import channel, channel_error, kinetic_energy, taylor_green, taylor_green_error
+
+SOURCES = ("examples/benchmarks/speed_error.py", "torchsph/methods/forecast_skill.py", *MODEL)
 
 SAMPLE = sample_truth()
 DECAY_TIME = 100 / (8 * math.pi**2)
@@ -348,7 +350,7 @@ def main() -> None:
         load = os.getloadavg()[0]
         print(f"load of the machine: {load:.2f}")
         if options.json:  # after each flow: a full run takes minutes
-            options.json.write_text(json.dumps({"rows": rows, "load": load, "quick": options.quick}, indent=1) + "\n")
+            write_table(options.json, {"rows": rows, "load": load, "quick": options.quick}, SOURCES)
         if options.picture:
             picture(rows, options.picture)
 

@@ -29,6 +29,12 @@ import scipy.sparse.linalg as sla
 import torch
 
 import regularize as rg
+from examples.provenance import write_table
+
+SOURCES = (
+    "examples/benchmarks/spline.py",
+    "regularize",
+)
 
 AXES = torch.tensor([40e-3, 20e-3, 20e-3], dtype=torch.float64)  # semi-axes of the ventricle-like ellipsoid, m
 TOLERANCE = 1e-6
@@ -273,7 +279,7 @@ def main() -> None:
         rows.append(json.loads(done.stdout))
         show(rows[-1])
         if options.json:
-            options.json.write_text(json.dumps({"rows": rows, "threads": options.threads}, indent=1))
+            write_table(options.json, {"rows": rows, "threads": options.threads}, SOURCES)
     if options.png:
         draw(rows, options.png)
 

@@ -14,7 +14,6 @@ one has not.
 from __future__ import annotations
 
 import argparse
-import json
 import subprocess
 import sys
 import tempfile
@@ -29,8 +28,11 @@ from scipy.ndimage import gaussian_filter
 
 import geometry
 import regularize
+from examples.provenance import SPLINES, write_table
 from torchsph.evaluation.frames import matching_frames
 from torchsph.methods.measurement.frame_splines import FrameSmoother, node_weights
+
+SOURCES = ("examples/benchmarks/spline_phantom.py", *SPLINES)
 
 WIDTH = 3e-3  # m, full width at half maximum of the Gaussian
 BLUR = 10e-3  # s, standard deviation of the average over time
@@ -204,7 +206,7 @@ def main() -> None:
         print(path.name)
         found[path.name] = compare(truth, geometry.read_recording(path), options.every, options.pymust)
     if options.json:
-        options.json.write_text(json.dumps(found, indent=1))
+        write_table(options.json, found, SOURCES)
 
 
 if __name__ == "__main__":

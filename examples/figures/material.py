@@ -6,7 +6,7 @@ import json
 import re
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TypeVar
@@ -17,11 +17,19 @@ import geometry
 import regularize
 import torchsph as ts
 from torchsph.data import sample_measurement, sample_truth
+from torchsph.methods.measurement.prepared import PreparedMeasurement
 
-from .record import ROOT, code_hash
+from ..provenance import ROOT, code_hash
 
 Part = TypeVar("Part")
 PHANTOM, MEASUREMENTS = "lv_phantom_a.h5", {"measured": "lv_phantom_a_measured.h5", "noisy": "lv_phantom_a_noisy.h5"}
+ROOMS = (
+    "geometry",
+    "regularize",
+    "torchsph/simulator",
+    "torchsph/pairs",
+    "torchsph/methods",
+)  # that analyses run through
 FILLING = 0.26, 0.32  # s, what the fast variants take of the sample: the early wave
 
 
@@ -88,16 +96,18 @@ class Material:
 
     @cached_property
     def measured(self) -> geometry.Recording:
-        """What a speckle tracker would report of it, frames of 10 ms."""
+        """What a speckle tracker would report of it, frames of 10 ms; every other node of three of them if fast."""
         if not self.fast:
             return geometry.read_recording(str(self._file(MEASUREMENTS["measured"])))
         whole = geometry.read_recording(str(sample_measurement()))
-        return whole.select((whole.time > FILLING[0] + 0.02 - 1e-6) & (whole.time < FILLING[0] + 0.05 - 1e-6))
+        few = whole.select((whole.time > FILLING[0] + 0.02 - 1e-6) & (whole.time < FILLING[0] + 0.05 - 1e-6))
+        return coarser(few, 2)
 
     @cached_property
     def true_frames(self) -> geometry.Recording:
-        """The truth at the measurement's times."""
-        return self.truth.select(np.isin(np.rint(1e5 * self.truth.time), np.rint(1e5 * self.measured.time)))
+        """The truth at the measurement's times, on its grid."""
+        there = self.truth.select(np.isin(np.rint(1e5 * self.truth.time), np.rint(1e5 * self.measured.time)))
+        return coarser(there, 2) if self.fast else there
 
     def frames_every(self, interval: float, count: int) -> list[int]:
         """``count`` frames of the truth ``interval`` (s) apart, from the first one on."""
@@ -112,10 +122,10 @@ class Material:
         """
         if method in self._made:
             return self._made[method]
-        # what can change an analysis: every room that it runs through
-        rooms = ("geometry", "regularize", "torchsph/simulator", "torchsph/pairs", "torchsph/methods")
-        name = f"{method.replace(', ', '-')}-{self.seed}-{code_hash(rooms)}.h5"
-        file = None if self.kept is None or self.fast else self.kept / name
+        file = None
+        if self.kept is not None and not self.fast:
+            name = f"{method.replace(', ', '-')}-{self.seed}-{code_hash(ROOMS)}.h5"
+            file = self.kept / name
         if file is not None and file.is_file():
             return self._made.setdefault(method, geometry.read_recording(str(file)))
         with warnings.catch_warnings():
@@ -139,7 +149,9 @@ class Material:
             return ts.smooth(measured)
         if method == "sph, thesis":
             model = ts.Simulator(ts.Scene.from_recording(measured, spacing), ts.preset("thesis"))
-            return ts.filter_sph(measured, model, seed=self.seed).recording
+            # its splines tell how noisy the measurement is
+            prepared = PreparedMeasurement(measured, smoothed=self.analysis("spline, default"))
+            return ts.filter_sph(prepared, model, seed=self.seed).recording
         if method == "ensemble, default":
             few = {"spacing": 4e-3, "members": 4} if self.fast else {}
             kept = {} if checkpoint is None else {"checkpoints": checkpoint, "resume": True}
@@ -151,6 +163,19 @@ class Material:
         if not file.is_file():
             raise FileNotFoundError(f"{file}: the phantom is not there; name its folder by --data, or take --fast")
         return file
+
+
+def coarser(recording: geometry.Recording, every: int) -> geometry.Recording:
+    """Every so manieth node of a recording."""
+    few = (..., *(slice(None, None, every),) * recording.dimension)
+    grid = recording.grid
+    shape = tuple(-(-n // every) for n in grid.shape)
+    fields = {name: getattr(recording, name) for name in ("velocity", "mask", "weight", "sigma", "pressure")}
+    return replace(
+        recording,
+        grid=geometry.Grid(grid.origin, tuple(every * h for h in grid.spacing), shape),
+        **{name: np.asarray(field)[few] for name, field in fields.items() if field is not None},
+    )
 
 
 def per_frame_error(found: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -6,14 +6,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
 
+from ..provenance import ANALYSES, MODEL, TRACKING
 from .material import Material
 from .record import Result
 
 GEOMETRY = ("geometry",)
-SPLINES = ("geometry", "regularize", "torchsph/methods/measurement")
-MODEL = ("geometry", "torchsph/simulator", "torchsph/pairs")
 FORECASTS = (*MODEL, "torchsph/methods/forecast_skill.py")
-ANALYSES = (*MODEL, "regularize", "torchsph/methods", "torchsph/assimilation")
 OWN = ("examples/figures/material.py",)
 
 
@@ -50,7 +48,7 @@ FIGURES = {
     for entry in (
         Entry("phantom", "figs. 4.1 and 4.2", "the phantom in two planes", GEOMETRY),
         Entry("segmentation", "fig. 4.3", "a mesh from velocities, with normals", GEOMETRY),
-        Entry("tracked", "figs. 4.4 and 4.5", "tracked velocities in two planes", ("geometry", "torchsph/ultrasound")),
+        Entry("tracked", "figs. 4.4 and 4.5", "tracked velocities in two planes", TRACKING),
         Entry("wedge", "fig. 4.6", "a dam breaks on a wedge", MODEL),
         Entry("smoothing", "figs. 4.7 and 4.8", "what imposing, fetching and splines smooth", (*MODEL, "regularize")),
         Entry("panels", "figs. 4.9 and 4.10", "the same in one frame", (*MODEL, "regularize")),

@@ -22,7 +22,7 @@ from torchsph.evaluation.slices import Plane, cut, valve_plane
 DPI = 80
 WIDTH = 10.0  # inches, of a picture
 PANEL = 1.9  # inches, of one frame in a plane
-COLOURS = 96  # of a picture's palette: keeps its file small
+COLOURS = 128  # of a picture's palette: keeps its file small
 SPEEDS = "magma"
 COLOUR = {
     "truth": "0.2",
@@ -84,14 +84,15 @@ def sequence(
     top: float,
 ) -> Figure:
     """Rows of velocities (T, 3, *shape), each in its plane, a column for each frame."""
-    figure, panels = axes(len(rows), len(frames), PANEL * len(frames), 1.55 * PANEL)
+    left, right, low, high = next(iter(rows.values()))[1].extent
+    figure, panels = axes(len(rows), len(frames), PANEL * len(frames) + 1, 0.95 * PANEL * (high - low) / (right - left))
     for line, (name, (velocity, plane)) in zip(panels, rows.items(), strict=True):
         for axis, frame in zip(line, frames, strict=True):
             mesh = flow(axis, recording, velocity[frame], frame, plane, top)
         line[0].set_ylabel(name, fontsize=9)
     for axis, frame in zip(panels[0], frames, strict=True):
         axis.set_title(f"{1e3 * recording.time[frame]:.0f} ms", fontsize=9)
-    figure.colorbar(mesh, ax=panels, label="m/s", fraction=0.015, pad=0.01)
+    figure.colorbar(mesh, ax=panels, label="m/s", fraction=0.05, pad=0.01, shrink=min(1.0, 2 / len(rows)), aspect=30)
     return figure
 
 
@@ -100,7 +101,7 @@ def save(figure: Figure, file: Path) -> None:
     buffer = io.BytesIO()
     figure.savefig(buffer, dpi=DPI, format="png")
     plt.close(figure)
-    image = Image.open(buffer).convert("RGB").quantize(COLOURS, dither=Image.Dither.NONE)
+    image = Image.open(buffer).convert("RGB").quantize(COLOURS, kmeans=1, dither=Image.Dither.NONE)
     part = file.with_suffix(".part")
     image.save(part, format="PNG", optimize=True)
     part.replace(file)

@@ -23,7 +23,8 @@ def page(results: Path) -> str:
             continue
         content = json.loads(file.read_text(encoding="utf-8"))
         parts.append(f"## {entry.title[0].upper()}{entry.title[1:]}\n")
-        parts.append(f"Grønli 2017, {entry.thesis}; {content['seconds']:.0f} s.\n")
+        fast = " The fast variant, coarse and short, on the sample recording." if content["fast"] else ""
+        parts.append(f"Grønli 2017, {entry.thesis}; {content['seconds']:.0f} s.{fast}\n")
         parts.append(f"![{entry.title}](results/{name}.png)\n")
         parts.append("| observed then | here | number |\n|---|---|---|")
         for claim in content["claims"]:

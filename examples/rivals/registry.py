@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from ..provenance import ROOT
 from .methods import denoiser, gaussian, ivfm, leray, pinn, siren, smoothn, temporal
 
 
@@ -21,12 +22,14 @@ class Rival:
         source: whose idea it is.
         tried: values of each setting that `--tune` tries, all combinations.
         fixed: settings that are not tuned.
+        learns: whether it learns from other flows when it is first called; the seconds of that do not count.
     """
 
     fit: Callable[..., np.ndarray]
     source: str
     tried: dict[str, tuple[Any, ...]] = field(default_factory=dict)
     fixed: dict[str, Any] = field(default_factory=dict)
+    learns: bool = False
 
     def combinations(self) -> list[dict[str, Any]]:
         """All settings that are tried."""
@@ -60,7 +63,13 @@ RIVALS: dict[str, Rival] = {
         {"width": (5e-3, 1e-2), "smoothness": (1.0, 2.0), "divergence": (10.0,), "wall": (3.0,)},
         {"on": ivfm.fit},
     ),
-    "denoiser": Rival(denoiser.fit, "convolutions trained on simulated flows", {"flows": (4,), "steps": (300,)}),
+    "denoiser": Rival(
+        denoiser.fit,
+        "convolutions trained on simulated flows",
+        {"flows": (4,), "steps": (300,)},
+        {"kept": ROOT / "examples" / "rivals" / "results" / "kept"},
+        learns=True,
+    ),
     "siren": Rival(
         siren.fit,
         "neural field as a curl, after DAF-FlowNet (arXiv 2604.00205)",

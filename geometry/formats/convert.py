@@ -169,6 +169,8 @@ def _walled(fields: Fields, said: FieldMap, options: WallOptions, about: _Consta
         description=description + "".join(f"; {note}" for note in fields.notes),
         weight=weight,
         sigma=fields.sigma,
+        cut=said.cut,
+        nyquist=None if said.nyquist is None else np.full(len(fields.time), said.nyquist),
         rho=about.rho,
         mu=about.mu,
         period=about.period,

@@ -43,6 +43,8 @@ class FieldMap:
         columns: of a text file of scattered tracks, as `id,x,y,z,u,v,w,-,t`.
         grid_spacing: m, of the grid that tracks, or the inside of a wall, are put on.
         bin: frames of tracks that make one volume; 0 = all of them.
+        nyquist: m/s, at which each component wraps.
+        cut: whether a plane is cut out of a flow in space.
     """
 
     velocity: tuple[str, ...] = ()
@@ -65,6 +67,8 @@ class FieldMap:
     columns: str = ""
     grid_spacing: float | None = None
     bin: int = 0
+    nyquist: float | None = None
+    cut: bool = False
 
     def __post_init__(self) -> None:
         if self.axes and self.axes != "auto":
@@ -79,7 +83,7 @@ class FieldMap:
                     factor(getattr(self, name), name.removesuffix("_unit"))
                 except ValueError as fault:
                     raise FormatError(f"{name}: {fault}") from fault
-        for name in ("interval", "grid_spacing"):
+        for name in ("interval", "grid_spacing", "nyquist"):
             value = getattr(self, name)
             if value is not None and not 0 < value < float("inf"):
                 raise FormatError(f"{name}: must be positive, not {value}")

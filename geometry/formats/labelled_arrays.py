@@ -27,6 +27,7 @@ ATTRIBUTES = {
     },
     "sigma": {"units": "m s-1", "long_name": "standard deviation of the velocity"},
     "beam": {"units": "1", "long_name": "unit vector along the beam"},
+    "nyquist": {"units": "m s-1", "long_name": "speed at which the measurement wraps"},
     "pressure": {"units": "Pa", "long_name": "pressure"},
     "pressure_sigma": {"units": "Pa", "long_name": "standard deviation of the pressure"},
     "wall_vertices": {"units": "m"},
@@ -69,6 +70,7 @@ def to_xarray(recording: Recording) -> xarray.Dataset:
     coordinates["time"] = ("time", recording.time, {"units": "s", "axis": "T", "long_name": "time in the beat"})
     coordinates["component"] = ("component", list("xyz"[: recording.dimension]), {})
     about = {name: getattr(recording, name) for name in ("rho", "mu", "period", "description")}
+    about |= {"cut": 1} if recording.cut else {}
     lattice = {"origin": np.array(grid.origin), "spacing": np.array(grid.spacing)}
     return xarray.Dataset(variables, coordinates, {"Conventions": "CF-1.11", **about, **lattice})
 
@@ -95,6 +97,7 @@ def from_xarray(dataset: xarray.Dataset) -> Recording:
     wall = {name[5:]: array for name, array in values.items() if name.startswith("wall.")}
     rest = {name: array for name, array in values.items() if not name.startswith("wall.")}
     about = {name: dataset.attrs[name] for name in ("rho", "mu", "period", "description") if name in dataset.attrs}
+    about |= {"cut": True} if dataset.attrs.get("cut") else {}
     whole: dict[str, Any] = {**rest, **about, **({"wall": Wall(**wall)} if wall else {})}
     labels = {str(label).replace("flux_", f"{GROUP}/", 1): label for label in dataset.variables}
     whole["fluxes"] = fluxes_of({name: dataset[label].values for name, label in labels.items() if is_flux(name)})
@@ -113,6 +116,7 @@ def _dimensions(name: str, recording: Recording, rank: int) -> tuple[str, ...]:
         "velocity": ("time", "component", *space),
         "sigma": ("time", "component", *space),
         "beam": ("time", "component", *space)[-rank:],
+        "nyquist": ("time", "component")[:rank],
         "wall.vertices": ("time", "vertex", "component")[-rank:],
         "wall.velocity": ("time", "vertex", "component"),
         "wall.sigma": ("time", "vertex")[-rank:],

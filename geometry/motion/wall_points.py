@@ -62,9 +62,9 @@ class WallSampler:
         count, faces = int(group.max()) + 1, len(surface.faces)
         share = 1 / np.bincount(owner)[owner]
         area = share * surface.areas[owner]
-        whole = np.bincount(group, weights=area)[group]
-        # faces without an area, from vertices that coincide, have a middle all the same
-        part = np.where(whole > 0, area / np.where(whole > 0, whole, 1.0), 1 / np.bincount(group)[group])
+        total, pieces = np.bincount(group, weights=area)[group], np.bincount(group)[group]
+        # faces without any area, as where a cut passes through a vertex, stay places with a mean over their corners
+        part = np.divide(area, total, out=1.0 / pieces, where=total > 0)
         mean = part[:, None] * weights
         rows = np.repeat(group, surface.dimension)
         # Points and velocities are means over vertices, area vectors sums over faces: linear maps, made once.

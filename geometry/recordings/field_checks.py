@@ -98,6 +98,8 @@ def derivative_products(velocity: np.ndarray, measured: np.ndarray, spacing: tup
 
 def wrapped_speeds(recording: Recording) -> Iterator[Finding]:
     """Tell of neighbours that differ by nearly twice a common limit: aliased Doppler or phase-contrast speeds."""
+    if recording.nyquist is not None:  # it is known, and taken back by whoever works with the measurement
+        return
     measured = measured_nodes(recording)
     if recording.beam is None:
         parts: dict[str, int | None] = {f"component {'xyz'[c]}": c for c in range(recording.dimension)}
@@ -119,9 +121,8 @@ def wrapped_speeds(recording: Recording) -> Iterator[Finding]:
                 pairs += step.size
         if limit > 0 and jumps > max(10, WRAPPED_SHARE * pairs) and near > 0.5 * below:
             rule = f"{name} jumps by nearly {2 * limit:.3g} m/s between {jumps} of {pairs} neighbours, as speeds that"
-            yield Finding(
-                "/velocity", f"{rule} have wrapped at +-{limit:.3g} m/s do", "unwrap them, or give them /weight 0"
-            )
+            cure = "give the limit as /nyquist (convert --nyquist), unwrap them, or give them /weight 0"
+            yield Finding("/velocity", f"{rule} have wrapped at +-{limit:.3g} m/s do", cure)
 
 
 def _component(recording: Recording, frame: int, component: int | None) -> np.ndarray:

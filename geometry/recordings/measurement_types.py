@@ -29,11 +29,13 @@ class MeasurementType(ABC):
         name: in words, for messages.
         dataset: of the recording that tells the type, "" for none.
         full: whether the components are the whole vector.
+        nyquist: (T,) or (T, parts), m/s, of a measurement that wraps: each component is known modulo twice this.
     """
 
     name: ClassVar[str]
     dataset: ClassVar[str]
     full: ClassVar[bool] = False
+    nyquist: np.ndarray | None = None
 
     @classmethod
     @abstractmethod
@@ -58,10 +60,18 @@ class MeasurementType(ABC):
         found = self.components(velocity)
         return np.stack([(part[:, None] * self.directions(frame)).sum(0) for frame, part in enumerate(found)])
 
+    def limits(self, frame: int) -> np.ndarray | None:
+        """(parts,) speeds, m/s, at which the components of a frame wrap; None where nothing does."""
+        return None if self.nyquist is None else np.broadcast_to(self.nyquist[frame], (self.parts,))
+
     def at(self, frame: int, node: Tensor) -> Components:
         """The components at nodes (q,), flat indices, of one frame."""
         along = np.ascontiguousarray(self.directions(frame), np.float64)
-        return Components(torch.from_numpy(along).flatten(2)[:, :, node].mT, self.full)
+        return Components(torch.from_numpy(along).flatten(2)[:, :, node].mT, self.full, self._limit(frame))
+
+    def _limit(self, frame: int) -> Tensor | None:
+        limits = self.limits(frame)
+        return None if limits is None else torch.from_numpy(limits.copy())
 
     def require_full(self, purpose: str) -> None:
         """Refuse what needs whole vectors.
@@ -83,10 +93,12 @@ class Components:
     Attributes:
         directions: (parts, q, D) unit vectors, float64.
         full: whether the components are the whole vector, x first.
+        limit: (parts,), m/s: each component is known modulo twice this; None where nothing wraps.
     """
 
     directions: Tensor
     full: bool
+    limit: Tensor | None = None
 
     @property
     def parts(self) -> int:
@@ -128,13 +140,13 @@ class FullVectors(MeasurementType):
     dataset = ""
     full = True
 
-    def __init__(self, dimension: int) -> None:
-        self.dimension = dimension
+    def __init__(self, dimension: int, nyquist: np.ndarray | None = None) -> None:
+        self.dimension, self.nyquist = dimension, nyquist
 
     @classmethod
     def of(cls, recording: Recording) -> FullVectors:
         """Of every recording: it is asked last."""
-        return cls(recording.dimension)
+        return cls(recording.dimension, recording.nyquist)
 
     @property
     def parts(self) -> int:
@@ -156,7 +168,7 @@ class FullVectors(MeasurementType):
     def at(self, frame: int, node: Tensor) -> Components:
         """Components of a frame at some nodes: the vectors themselves."""
         axes = torch.eye(self.dimension, dtype=torch.float64)
-        return Components(axes[:, None].expand(-1, len(node), -1), True)
+        return Components(axes[:, None].expand(-1, len(node), -1), True, self._limit(frame))
 
 
 class AlongBeam(MeasurementType):
@@ -165,18 +177,19 @@ class AlongBeam(MeasurementType):
     Args:
         beam: (T, D, *shape), or (D, *shape) for all frames, unit vectors.
         dimension: D.
+        nyquist: (T,), m/s, at which the speeds wrap, or None.
     """
 
     name = "one component along a beam"
     dataset = "/beam"
 
-    def __init__(self, beam: np.ndarray, dimension: int) -> None:
-        self.beam, self.moving = beam, beam.ndim == dimension + 2
+    def __init__(self, beam: np.ndarray, dimension: int, nyquist: np.ndarray | None = None) -> None:
+        self.beam, self.moving, self.nyquist = beam, beam.ndim == dimension + 2, nyquist
 
     @classmethod
     def of(cls, recording: Recording) -> AlongBeam | None:
         """The type of a recording that holds one component along a beam."""
-        return None if recording.beam is None else cls(recording.beam, recording.dimension)
+        return None if recording.beam is None else cls(recording.beam, recording.dimension, recording.nyquist)
 
     @property
     def parts(self) -> int:

@@ -14,6 +14,7 @@ class Quality(IntEnum):
     OUTLIER = 3  # what was measured there is farther from the forecast than both their errors allow
     OUT_OF_REACH = 4  # what was measured there is too far from everything that it could change
     FAILED = 5  # the forecast has no value there
+    AMBIGUOUS = 6  # what was measured there has wrapped, and the forecast cannot tell how often
 
 
 QUALITY_NAMES = tuple(code.name.lower().replace("_", " ") for code in Quality)

@@ -30,6 +30,7 @@ QUANTITIES = {
     "/time": "time",
     "/velocity": "velocity",
     "/sigma": "velocity",
+    "/nyquist": "velocity",
     "/pressure": "pressure",
     "/pressure_sigma": "pressure",
     "/wall/vertices": "length",
@@ -157,11 +158,15 @@ def _built(file: h5py.File, grid: Grid, arrays: Mapping[str, np.ndarray], source
     rest: dict[str, Any] = {names[d]: a for d, a in arrays.items() if d in names and not d.startswith("/wall/")}
     numbers: dict[str, Any] = {name: _number(file, name, source) for name in ("rho", "mu")}
     period = _number(file, "period", source) if "period" in file.attrs else 0.0
+    cut = _number(file, "cut", source) if "cut" in file.attrs else 0.0
+    if cut not in (0, 1):
+        raise RecordingError(source, "attribute cut", f"must be 0 or 1, not {cut:g}")
     try:
         return Recording(
             grid=grid,
             wall=Wall(**wall) if wall else None,
             period=period,
+            cut=bool(cut),
             description=_text(file, "description", source),
             fluxes=fluxes_of(arrays),
             **numbers,

@@ -31,6 +31,7 @@ LAYOUT: tuple[tuple[str, str, type], ...] = (
     ("uncovered", "/uncovered", np.int64),
     ("quality", "/quality", np.uint8),
     ("beam", "/beam", np.float32),
+    ("nyquist", "/nyquist", np.float64),
     ("pressure", "/pressure", np.float32),
     ("pressure_sigma", "/pressure_sigma", np.float32),
     ("wall.vertices", "/wall/vertices", np.float64),
@@ -120,6 +121,8 @@ class Recording:
         flux_mitral: (T,), m^3/s, positive into the ventricle.
         flux_aortic: (T,), m^3/s, likewise.
         fluxes: measured fluxes of regions, with their errors.
+        nyquist: (T,), or (T, D) for each component of full vectors, m/s: what was measured is known modulo twice this.
+        cut: of a plane, whether it is cut out of a flow in space, so that something passes through it.
 
     Raises:
         RecordingError: shapes that disagree; `geometry.check_recording` tests every rule of the format.
@@ -148,6 +151,8 @@ class Recording:
     flux_mitral: np.ndarray | None = None
     flux_aortic: np.ndarray | None = None
     fluxes: tuple[OpeningFlux, ...] = ()
+    nyquist: np.ndarray | None = None
+    cut: bool = False
 
     def __post_init__(self) -> None:
         _check_kinds(self)
@@ -238,9 +243,9 @@ class Recording:
     ) -> Recording:
         """Another velocity (T, D, *shape), m/s, between the same walls: an analysis or a forecast.
 
-        What belonged to the old velocity (weight, sigma, quality, beam, pressure, fluxes) is dropped.
+        What belonged to the old velocity (weight, sigma, quality, beam, nyquist, pressure, fluxes) is dropped.
         """
-        gone: dict[str, Any] = dict.fromkeys(("weight", "beam", "pressure", "pressure_sigma"))
+        gone: dict[str, Any] = dict.fromkeys(("weight", "beam", "nyquist", "pressure", "pressure_sigma"))
         gone |= dict.fromkeys(("flux_mitral", "flux_aortic"))
         text = self.description if description is None else description
         new: dict[str, Any] = {"velocity": velocity, "sigma": sigma, "uncovered": uncovered, "quality": quality}
@@ -269,7 +274,7 @@ class Recording:
 
 def _check_kinds(recording: Recording) -> None:
     """Refuse what is no grid, wall, flux, text or number in the place of one; numbers become Python's."""
-    kinds = (("grid", Grid), ("wall", Wall | None), ("description", str), ("fluxes", tuple))
+    kinds = (("grid", Grid), ("wall", Wall | None), ("description", str), ("fluxes", tuple), ("cut", bool))
     wrong = [name for name, kind in kinds if not isinstance(getattr(recording, name), kind)]
     if wrong or not all(isinstance(flux, OpeningFlux) for flux in recording.fluxes):
         name = wrong[0] if wrong else "fluxes"
@@ -335,6 +340,7 @@ def _allowed_shapes(recording: Recording) -> dict[str, tuple[tuple[int, ...], ..
         "/uncovered": ((frames,),),
         "/quality": ((frames, *shape),),
         "/beam": ((frames, dimension, *shape), (dimension, *shape)),
+        "/nyquist": ((frames,),) if recording.beam is not None else ((frames,), (frames, dimension)),
         "/pressure": ((frames, *shape),),
         "/pressure_sigma": ((frames, *shape),),
         **({} if recording.wall is None else _allowed_wall_shapes(recording.wall, frames, dimension)),

@@ -45,6 +45,7 @@ def check_recording(recording: Recording, source: str = "recording") -> None:
     for rule in (
         _constants,
         _description,
+        _cut,
         _grid,
         _time,
         _weight,
@@ -53,6 +54,7 @@ def check_recording(recording: Recording, source: str = "recording") -> None:
         _speed,
         _sigma,
         _beam,
+        _nyquist,
         _overlap,
         _valves,
         _series,
@@ -88,6 +90,13 @@ def _description(recording: Recording, source: str) -> None:
     if "\0" in text or any("\ud800" <= letter <= "\udfff" for letter in text):
         rule = "must be plain text without NUL and without halves of surrogate pairs; leave out what is not text"
         raise RecordingError(source, "attribute description", rule)
+
+
+def _cut(recording: Recording, source: str) -> None:
+    if recording.cut and recording.dimension != 2:
+        raise RecordingError(
+            source, "attribute cut", "is 1, for a plane cut out of a flow in space, but this is a volume"
+        )
 
 
 def _grid(recording: Recording, source: str) -> None:
@@ -168,6 +177,13 @@ def _beam(recording: Recording, source: str) -> None:
     if bad.any():
         rule = f"must hold unit vectors, but does not at {_first(bad)}; divide by their length"
         raise RecordingError(source, "/beam", rule)
+
+
+def _nyquist(recording: Recording, source: str) -> None:
+    limit = recording.nyquist
+    if limit is not None and not ((limit > 0) & (limit <= FASTEST)).all():
+        rule = f"is the speed at which a measurement wraps, m/s: positive and at most {FASTEST:g}, not {limit.min():g}"
+        raise RecordingError(source, "/nyquist", f"{rule}; leave it out where nothing wraps")
 
 
 def _wall(recording: Recording, source: str) -> None:

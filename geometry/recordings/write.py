@@ -72,6 +72,8 @@ def _fill(file: h5py.File, recording: Recording) -> None:
         period=recording.period,
         description=recording.description,
     )
+    if recording.cut:
+        file.attrs["cut"] = 1
     grid = file.create_group("grid")
     grid.attrs["origin"], grid.attrs["spacing"] = (
         np.array(recording.grid.origin),

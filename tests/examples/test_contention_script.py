@@ -24,8 +24,9 @@ def test_busy_processes_run_inside_the_block_and_end_with_it(script):
     assert all(process.returncode for process in spinning)
 
 
+@pytest.mark.slow
 def test_a_command_is_timed_and_one_that_fails_is_told(script):
-    wall, used = script.run(["--version"], 1, "passive")
+    wall, used = script.run(["--version"], 1, 1, "passive")
     assert wall > 0 and used > 0
     with pytest.raises(RuntimeError, match="no-such-command"):
-        script.run(["no-such-command"], 1, "passive")
+        script.run(["no-such-command"], 1, 1, "passive")

@@ -36,6 +36,7 @@ def test_the_limits_of_all_parts_stay_below_eight_minutes(script):
     assert set(script.LIMITS) == set(PARTS) and sum(script.LIMITS.values()) < 8 * 60
 
 
+@pytest.mark.slow
 def test_a_part_leaves_rows_with_numbers_and_the_table_names_the_machine(tmp_path):
     report, shown = run(tmp_path, "--parts", "machine", "pairs")
     assert [report[name]["ended"] for name in ("machine", "pairs")] == ["done", "done"]
@@ -55,6 +56,7 @@ def test_what_was_measured_before_a_part_hangs_or_dies_is_kept(script, tmp_path)
     assert script.read_rows(path) == [{"a": 1}, {"a": 2}] and script.read_rows(tmp_path / "none") == []
 
 
+@pytest.mark.slow
 def test_a_part_that_takes_too_long_is_stopped_and_the_next_one_runs(tmp_path):
     report, _ = run(tmp_path, "--parts", "steps", "machine", "--seconds", "2")
     assert "stopped after its 2 s" in report["steps"]["ended"] and "left out" in report["machine"]["ended"]

@@ -34,12 +34,16 @@ def notebook() -> dict:
 
 
 def test_the_notebook_runs_and_both_methods_take_noise_away(tmp_path, monkeypatch):
+    """As it stands but for two of its four frames, and their numbers in the pictures."""
     matplotlib.use("Agg")
     monkeypatch.chdir(tmp_path)
     names: dict = {}
-    for number, cell in enumerate(notebook()["cells"]):
-        if cell["cell_type"] == "code":
-            exec(compile("".join(cell["source"]), f"quickstart.ipynb, cell {number}", "exec"), names)
+    cells = {n: "".join(cell["source"]) for n, cell in enumerate(notebook()["cells"]) if cell["cell_type"] == "code"}
+    for printed, quick in (("slice(10, 14)", "slice(11, 13)"), ("frame=2)", "frame=0)"), ("frame=3)", "frame=1)")):
+        assert sum(printed in cell for cell in cells.values()) == 1
+        cells = {number: cell.replace(printed, quick) for number, cell in cells.items()}
+    for number, cell in cells.items():
+        exec(compile(cell, f"quickstart.ipynb, cell {number}", "exec"), names)
     assert max(names["errors"]["ensemble"], names["errors"]["splines"]) < 0.8 * names["errors"]["measured"]
     assert (tmp_path / "analysis.h5").is_file()
 
@@ -51,10 +55,7 @@ def test_the_notebook_is_one_and_carries_no_outputs():
 
 
 def test_errors_of_the_methods_are_those_of_the_results():
-    found = {
-        noise: result(f"filter_methods_{noise}.json")["measurements"][f"lv_phantom_a_{noise}"]
-        for noise in ("measured", "noisy")
-    }
+    found = {noise: result(f"filter_methods_{noise}.json")["rows"] for noise in ("measured", "noisy")}
     settings, accuracy = text("torchsph/SETTINGS.md"), text("torchsph/ACCURACY.md")
     for method in ("ensemble", "spline", "free", "sph"):
         both = [short(found[noise][method]["nrmse"]) for noise in found]
@@ -131,3 +132,78 @@ def test_the_picture_of_the_readme_is_drawn_from_the_results_that_are_there():
         assert picture.info["Comment"] == inputs_hash(), "redraw it: python examples/error_seconds.py"
     best = front(forecasts())
     assert all(a.seconds < b.seconds and a.error > b.error for a, b in zip(best, best[1:], strict=False))
+
+
+def cells(values) -> str:
+    """Numbers as the page of quantities shows them: two digits, three below a tenth."""
+    shown = []
+    for value in values:
+        if value == 0:
+            shown.append("0")
+        else:
+            text = f"{value:.3f}" if abs(value) < 0.1 else f"{value:.2f}"
+            shown.append(text.removeprefix("0"))
+    return " | ".join(shown)
+
+
+def test_what_to_believe_is_what_was_measured():
+    page = text("torchsph/haemodynamics/README.md")
+    measured, noisy = (result(f"quantities_{noise}.json") for noise in ("measured", "noisy"))
+    rows = {
+        "kinetic energy": "kinetic_energy",
+        "energy loss": "energy_loss",
+        "size of the vorticity": "vorticity_rms",
+        "axial force": "force_axial",
+        "flow through the inlet": "flow_inlet",
+        "flow through the outlet": "flow_outlet",
+    }
+    sources = ("formula", "raw", "spline", "ensemble", "members")
+    for name, curve in rows.items():
+        first = cells(measured["curves"][curve][source] for source in sources)
+        held, other, also = (
+            measured["coverage"][curve],
+            noisy["curves"][curve]["members"],
+            noisy["coverage"][curve],
+        )
+        assert f"| {name} | {first} | {held:.2f} | {cells([other])} | {also:.2f} |".replace("| 0.", "| .") in page, name
+    for table, prefix in ((measured, ""), (noisy, "noisy: ")):
+        found = table["pressure difference"]
+        errors = cells(found[source]["error"] for source in (*sources, "simulator"))
+        fits = " | ".join(f"{found[source]['correlation']:.3f}".removeprefix("0") for source in (*sources, "simulator"))
+        assert f"| {prefix}base less apex, error | {errors} |" in page
+        assert f"| {prefix}correlation | {fits} |" in page
+        field = table["fields"]["pressure"]
+        shown = [cells([field[source]]) if source in field else "" for source in (*sources, "simulator")]
+        assert f"| {prefix}field, mean removed | {' | '.join(shown)} |" in page
+
+
+RIVALS = {
+    "**ensemble**, the default": "ensemble",
+    "**splines**, frame by frame": "spline",
+    "Helmholtz-Leray projection, averaged over time": "leray over time",
+    "Gaussian in space and time": "gaussian over time",
+    "constrained least squares, as iVFM has it": "ivfm",
+    "the same, averaged over time": "ivfm over time",
+    "neural field, a curl (SIREN)": "siren",
+    "physics-informed network": "pinn",
+    "learned denoiser": "denoiser",
+    "Helmholtz-Leray projection": "leray",
+    "`smoothn`, as PyMUST has it": "smoothn",
+    "Gaussian": "gaussian",
+    "the measurement": "raw",
+}
+
+
+def test_the_readme_shows_rivals_as_they_were_found():
+    page, rows = text("README.md"), json.loads(text("examples/rivals/results/rivals.json"))["rows"]
+    both = {name: [rows[noise].get(key) for noise in ("measured", "noisy")] for name, key in RIVALS.items()}
+    expected = {name: pair for name, pair in both.items() if all(pair)}
+    for name, (measured, noisy) in expected.items():
+        found = (measured["nrmse"], noisy["nrmse"])
+        errors = " | ".join(short(value) if value < 1 else f"{value:.2f}" for value in found)
+        assert f"| {name} | {errors} | {measured['direction_error_deg']:.0f}° | " in page, name
+    assert len(re.findall(r"^\| .* \| .*° \| ", page, re.MULTILINE)) == len(expected)
+    words = page.replace("\n", " ")
+    for noise, said in (("measured", "from {} (splines) to {}"), ("noisy", "from {} to {} at twice the noise")):
+        pair = (f"{rows[noise][method]['nrmse']:.2f}".removeprefix("0") for method in ("spline", "ensemble"))
+        assert said.format(*pair) in words

@@ -196,6 +196,18 @@ def test_wall_points_refuse_nonsense() -> None:
             WallSampler(MOTION, **options)
 
 
+def test_faces_without_area_leave_no_points_without_a_place() -> None:
+    cube = box((0, 0, 0), (1, 1, 1), 1.0)
+    a, b, c = cube.faces[0]
+    middle, count = cube.vertices[[a, b]].mean(0), len(cube.vertices)
+    faces = np.concatenate([cube.faces[1:], [[a, count, c], [count, b, c], [a, b, count]]])  # the last one is a line
+    cut = Surface(np.vstack([cube.vertices, middle]), faces, np.zeros(len(faces), int))
+    wall = wall_points(WallMotion.at_rest(cut), 0.0, 0.25)
+    assert np.isfinite(wall.points).all() and np.isfinite(wall.velocities).all()
+    assert np.abs(np.abs(wall.points - 0.5).max(1) - 0.5).max() < 1e-12  # all of them on the cube
+    assert wall.areas.sum() == pytest.approx(6.0)
+
+
 def test_wall_points_of_a_refined_wall_are_those_of_the_wall() -> None:
     cube = box((0, 0, 0), (1, 1, 1), 1.0)
     one, other = (wall_points(WallMotion.at_rest(s), 0.0, 0.25) for s in (cube, refined(cube, 0.05)))

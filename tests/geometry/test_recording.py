@@ -32,6 +32,7 @@ def _full(box_recording: Callable[..., Recording]) -> Recording:
         "sigma": draw.uniform(size=(frames, 3, *shape)),
         "uncovered": [0, 1, 2],
         "beam": beam / np.linalg.norm(beam, axis=0),
+        "nyquist": [0.3, 0.3, 0.4],
         "pressure": draw.normal(size=(frames, *shape)),
         "valve_intervals": [[1, 0.0, 0.005], [2, 0.01, 0.02]],
         "valve_open": [[1, 0], [0, 1], [0, 1]],
@@ -189,6 +190,9 @@ RULES: list[tuple[str, Callable[[h5py.File], None], str]] = [
     ("weight shape", _replace("weight", lambda v: v[:1]), "/weight: has the shape"),
     ("sigma shape", _replace("sigma", lambda v: v[:, 0]), "/sigma: has the shape"),
     ("beam shape", _replace("beam", lambda v: v[:2]), "/beam: has the shape"),
+    ("nyquist shape", _replace("nyquist", lambda v: np.repeat(v[:, None], 3, 1)), "/nyquist: has the shape"),
+    ("nyquist 0", _set("nyquist", (1,), 0.0), "/nyquist: is the speed at which a measurement wraps"),
+    ("nyquist NaN", _set("nyquist", (1,), np.nan), "/nyquist: is the speed"),
     ("uncovered shape", _replace("uncovered", lambda v: v[:1]), "/uncovered: has the shape"),
     ("pressure shape", _replace("pressure", lambda v: v[0]), "/pressure: has the shape"),
     ("vertices shape", _replace("wall/vertices", lambda v: v[:2]), "/wall/vertices: has the shape"),
@@ -416,7 +420,7 @@ def test_select_takes_frames_of_everything(full: Recording) -> None:
 def test_with_velocity_drops_what_described_the_old_velocity(full: Recording) -> None:
     other = full.with_velocity(2 * full.velocity, uncovered=[1, 1, 1], description="analysis")
     assert other.description == "analysis" and other.uncovered.tolist() == [1, 1, 1]
-    for name in ("weight", "sigma", "beam", "pressure", "flux_mitral", "flux_aortic"):
+    for name in ("weight", "sigma", "beam", "nyquist", "pressure", "flux_mitral", "flux_aortic"):
         assert getattr(other, name) is None
     assert other.fluxes == ()
     np.testing.assert_array_equal(other.volume, full.volume)

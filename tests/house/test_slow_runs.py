@@ -59,6 +59,7 @@ def ran(root):
     return log.read_text() if log.exists() else ""
 
 
+@pytest.mark.slow
 def test_it_goes_on_where_it_was(checkout):
     assert run_slow.main(["tests/test_a.py"], checkout) == 0
     assert ran(checkout) == "a"
@@ -70,6 +71,7 @@ def test_it_goes_on_where_it_was(checkout):
     assert ran(checkout) == "abab"
 
 
+@pytest.mark.slow
 def test_another_commit_and_a_change_that_is_not_committed_run_all(checkout):
     assert run_slow.main([], checkout) == 0
     save(checkout)

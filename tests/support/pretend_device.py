@@ -12,19 +12,22 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import lru_cache
+from pathlib import Path
 from unittest import mock
 
 import pytest
 import torch
-from paths import ROOT
 from torch.utils import backend_registration
 from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_modes
 from torch.utils._pytree import tree_flatten, tree_map, tree_unflatten
 
+import torchsph
 from torchsph.pairs import choose_backend
 from torchsph.pairs.backends.triton_backend import CudaBackend
 
 NAME = "pretended"
+# the folder that holds the packages under test: the checkout, or where a wheel was installed
+HOME = str(Path(torchsph.__file__).parents[1])
 # operations whose result the processor needs before it can go on: numbers, or the shape of what comes out
 WAITING = {
     "_local_scalar_dense": "item",
@@ -153,10 +156,10 @@ def _plain(value: object) -> bool:
 def place() -> str:
     """The innermost line of our packages on the way here."""
     frame = sys._getframe(1)
-    packages = tuple(str(ROOT / package) for package in ("torchsph", "regularize", "geometry"))
+    packages = tuple(f"{HOME}/{package}/" for package in ("torchsph", "regularize", "geometry"))
     while frame is not None:
         if frame.f_code.co_filename.startswith(packages):
-            return f"{frame.f_code.co_filename.removeprefix(str(ROOT))[1:]}:{frame.f_lineno} {frame.f_code.co_name}"
+            return f"{frame.f_code.co_filename.removeprefix(HOME)[1:]}:{frame.f_lineno} {frame.f_code.co_name}"
         frame = frame.f_back
     return "outside our packages"
 

@@ -12,10 +12,10 @@ import pytest
 import torchsph
 
 
-def test_the_package_is_imported_without_torch_and_in_no_time():
+def test_the_package_is_imported_without_torch_and_in_no_time(tmp_path):
     program = "import time, sys; import torchsph, torchsph.cli; "
     program += "print(sorted({'torch', 'numpy', 'scipy', 'matplotlib'} & set(sys.modules)), time.process_time() < 1.5)"
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, cwd=tmp_path)
     assert done.stdout == "[] True\n"
 
 

@@ -9,6 +9,7 @@ the same state.
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass, replace
 
 import torch
@@ -18,6 +19,28 @@ from torch import Tensor
 from .errors import AssimilationError
 from .filters.base import Analysis, Filter
 from .observations import Observations, Screened
+
+# s between two looks for what other processes send: a share of what was waited already, at least and at most
+_NAP, _OF_THE_WAIT, _LONGEST_NAP = 5e-5, 0.02, 5e-2
+
+
+class PeerLost(RuntimeError):
+    """Another process has gone, or cannot be reached."""
+
+
+def arrived(work: dist.Work) -> None:
+    """Wait for an exchange in naps, between which a request to stop is heard.
+
+    Raises:
+        PeerLost: one of the processes has gone.
+    """
+    began = time.monotonic()
+    while not work.is_completed():
+        time.sleep(min(max(_OF_THE_WAIT * (time.monotonic() - began), _NAP), _LONGEST_NAP))
+    try:
+        work.wait()
+    except RuntimeError as fault:
+        raise PeerLost(f"another process of the run has gone: {fault}") from fault
 
 
 def member_slice(total: int, rank: int, processes: int) -> slice:
@@ -77,12 +100,12 @@ def gather_members(members: Tensor, counts: list[int], group: dist.ProcessGroup 
     padded = members.new_zeros(max(counts), *members.shape[1:])
     padded[: len(members)] = members
     parts = [torch.empty_like(padded) for _ in counts]
-    dist.all_gather(parts, padded, group=group)
+    arrived(dist.all_gather(parts, padded, group=group, async_op=True))
     return torch.cat([part[:count] for part, count in zip(parts, counts, strict=True)])
 
 
 def _counts(own: int, device: torch.device, group: dist.ProcessGroup | None) -> list[int]:
     mine = torch.tensor([own], device=device)
     parts = [torch.empty_like(mine) for _ in range(dist.get_world_size(group))]
-    dist.all_gather(parts, mine, group=group)
+    arrived(dist.all_gather(parts, mine, group=group, async_op=True))
     return [int(part) for part in parts]

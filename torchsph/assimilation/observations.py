@@ -24,6 +24,7 @@ class Reason(IntEnum):
     OUT_OF_REACH = 5  # farther than the localisation radius from every state variable
     THINNED = 6  # dropped beforehand, in favour of a neighbour with a correlated error
     QUALITY = 7  # dropped beforehand by the measurement's own quality flags
+    AMBIGUOUS = 8  # the value has wrapped, and the forecast cannot tell how often
 
 
 @dataclass(frozen=True)
@@ -184,11 +185,9 @@ def count_reasons(reason: Tensor) -> dict[str, int]:
 
 
 def _check_broadcast(name: str, part: Tensor, value: Tensor) -> None:
-    try:
-        fits = torch.broadcast_shapes(part.shape, value.shape) == value.shape
-    except RuntimeError:
-        fits = False
-    if not fits:
+    # by hand: torch.broadcast_shapes imports a computer algebra system, which takes a second of every process
+    along = zip(reversed(part.shape), reversed(value.shape), strict=False)
+    if part.ndim > value.ndim or not all(own in (1, wanted) for own, wanted in along):
         raise AssimilationError(
             f"{name} of shape {tuple(part.shape)} does not fit the values' shape {tuple(value.shape)}"
         )

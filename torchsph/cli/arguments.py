@@ -14,6 +14,8 @@ from torchsph.simulator.schemes.presets import PRESETS
 
 # folder of the results where no other is named
 OUT = "torchsph-out"
+# in the place of a spacing: as fine as the budget allows
+AUTO = "auto"
 
 
 class Parser(argparse.ArgumentParser):
@@ -34,8 +36,28 @@ class Parser(argparse.ArgumentParser):
 def add_model_options(parser: argparse.ArgumentParser) -> None:
     """Which simulator, how fine, and on which device."""
     parser.add_argument("--preset", choices=tuple(PRESETS), default="default", help="of the simulator (%(default)s)")
-    parser.add_argument("--spacing", type=number(0, open_below=True), metavar="M", help="of the particles, m")
+    parser.add_argument("--spacing", type=_spacing, metavar="M", help="of the particles, m, or auto: by --budget")
+    parser.add_argument(
+        "--budget",
+        type=number(0, open_below=True),
+        metavar="S",
+        help="seconds for the run: the finest particles are taken that fit",
+    )
     parser.add_argument("--device", default="cpu", metavar="D", help="cpu, cuda or cuda:N (%(default)s)")
+
+
+def _spacing(text: str) -> float | str:
+    return AUTO if text == AUTO else number(0, open_below=True)(text)
+
+
+def add_workers(parser: argparse.ArgumentParser) -> None:
+    """How many processes share the work."""
+    parser.add_argument(
+        "--workers",
+        type=whole(1),
+        metavar="N",
+        help="processes of one thread each that share the work, with the same result (as many as it may use cores)",
+    )
 
 
 def add_seed(parser: argparse.ArgumentParser, metavar: str = "S") -> None:

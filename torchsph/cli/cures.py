@@ -24,9 +24,11 @@ def late_fault(fault: BaseException, code: ExitCode, args: argparse.Namespace | 
         One line; None for faults that say all of it themselves.
     """
     if code is ExitCode.MEMORY:
-        from torchsph.methods.memory import NotEnoughMemory  # here, because it brings torch along
+        # here, because they bring torch along
+        from torchsph.methods.memory import NotEnoughMemory
+        from torchsph.methods.runtime.workers import KilledWorker
 
-        if isinstance(fault, NotEnoughMemory):  # foretold: it says how much, and which of the settings is to blame
+        if isinstance(fault, NotEnoughMemory | KilledWorker):  # they say how much, or who, and what to do about it
             return f"{_about(args)}{fault}"
         return f"{_about(args)}out of memory; {_cure(args, _LESS) or 'close other programs, or use a larger machine'}"
     if code is ExitCode.NUMERICAL:

@@ -21,7 +21,7 @@ DEBUG = "TORCHSPH_TRACEBACK"
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code (argparse itself leaves with 2 by `SystemExit`)."""
     args: argparse.Namespace | None = None
-    _wait_passively()
+    _keep_threads_calm()
     try:
         # here, so that an interruption of the long imports is one as well
         from .program import parsed
@@ -43,14 +43,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return int(code)
 
 
-def _wait_passively() -> None:
+def _keep_threads_calm() -> None:
     """Let threads that wait for others sleep, where nobody has said otherwise and torch is not loaded yet.
 
     By default they spin, at the end of each of thousands of small parallel regions; on a machine that is shared they
-    then wait for threads which the system has taken away, and keep these from coming back.
+    then wait for threads which the system has taken away, and keep these from coming back. The small matrices of numpy
+    and scipy are faster on one thread.
     """
     if "torch" not in sys.modules:
         os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    if "numpy" not in sys.modules:
+        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 
 def _failed(fault: BaseException, args: argparse.Namespace | None) -> int:

@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 __all__ = ["RunningMoments", "Summary", "around", "coverage", "summary"]
 
@@ -45,7 +45,7 @@ def summary(values: ArrayLike) -> Summary:
     if count < 2:
         raise ValueError(f"summary: a spread needs at least 2 members, not {count}")
     mean, deviation = members.mean(0), members.std(0, ddof=1)
-    reach = student.ppf(BAND[1], count - 1) * np.sqrt(1 + 1 / count) * deviation
+    reach = stdtrit(count - 1, BAND[1]) * np.sqrt(1 + 1 / count) * deviation
     return Summary(mean, deviation, mean - reach, mean + reach)
 
 

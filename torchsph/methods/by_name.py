@@ -4,86 +4,50 @@ from __future__ import annotations
 
 import time as clock
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, field
-from functools import cached_property
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 import geometry
 import regularize
 from geometry.arguments import between, checked
-from torchsph.simulator.scene import Scene
 from torchsph.simulator.schemes.presets import preset as scheme_preset
-from torchsph.simulator.simulator import Simulator
 from torchsph.simulator.state.checks import MOST_MEMBERS, SPACING
 
-from .ensemble.assimilate import EnsembleRun, assimilate, default_filter, further
-from .ensemble.identity import ensemble_key
 from .ensemble.options import EnsembleOptions
-from .forecast_skill import ForecastSkill, skill
-from .free_run import run_freely
+from .forecast_skill import ForecastSkill, skill, starts
+from .measurement.frame_splines import CHOICE_EVERY
 from .measurement.prepared import PreparedMeasurement
-from .members.amplitude import Amplitude
-from .members.draws import spline_frames
-from .members.frames import FrameObserver
-from .members.kept import MemberFile
-from .members.quantities import MemberCurves, MemberQuantities, quantified, with_pressure
 from .memory import MemoryPrediction, free_memory, predicted
-from .nudging import filter_sph
+from .methods_run import METHODS, MethodResult, MethodsRun
+from .models import CONTROL_SHARE, Models, analysis_spacing, make_model
 from .runtime.checkpoint import Saved
-from .runtime.parallel import from_last, is_last, is_lead
+from .runtime.parallel import is_lead
 from .runtime.watching import Watcher
+from .runtime.workers import MOST_WORKERS, chosen_workers, spread
 
-METHODS = ("free", "spline", "sph", "ensemble")
+__all__ = [
+    "DEFAULT_MEMBERS",
+    "DEFAULT_METHOD",
+    "METHODS",
+    "MethodResult",
+    "forecast_skill",
+    "make_model",
+    "make_smoother",
+    "parallel_tasks",
+    "predicted_forecast_memory",
+    "predicted_memory",
+    "run_methods",
+]
+
 # Written to analysis.h5 and run when no method is named: the one that wins on a CFD phantom in every case tried. RMS
-# error of the ensemble over that of the splines: .81 and .76 over the beat at two noise levels; over 200 ms of ejection
+# error of the ensemble over that of the splines: .80 and .75 over the beat at two noise levels; over 200 ms of ejection
 # and filling .84, .75, .68 and .67 at 25, 50, 100 and 200 Hz, .69 and .66 at half and double noise, .69 with a weight
 # that says nothing, .71 with one Doppler component (filter_*.json in examples/benchmarks/results).
 DEFAULT_METHOD = "ensemble"
 DEFAULT_MEMBERS = 16
-# particle spacing in grid spacings of the single runs and of the ensemble's members; its control run takes half of it
-ANALYSIS_SPACING = 2.0
-CONTROL_SHARE = 0.5
 # of a recording's frames, what forecasts from them hold at once beside those that are saved
 FORECAST_COPIES = 2
-
-# Between frames that correct it, coarser particles resolve less in time as well: in a human ventricle with 3 and 6 mm,
-# steps of up to 0.7 spacings per m/s leave the ensemble's error as it is (.410, .409 with 0.7 ms) at 0.64 times the
-# cost. At 1 mm they are the preset's own.
-LONG_STEPS: dict[str, Any] = {"max_step": None, "longest_step": 0.7}
-
-
-@dataclass(frozen=True)
-class MethodResult:
-    """What one method made of a measurement, and where they were asked for the quantities of all its members."""
-
-    recording: geometry.Recording
-    seconds: float
-    info: dict[str, Any] = field(default_factory=dict)
-    quantities: MemberCurves | None = None
-
-
-@checked(spacing=SPACING)
-def make_model(
-    recording: geometry.Recording,
-    *,
-    preset: str = "default",
-    spacing: float | None = None,
-    device: str = "cpu",
-    estimates: geometry.Estimates | None = None,
-) -> Simulator:
-    """A simulator of the recording's walls and valves.
-
-    Args:
-        recording: whose walls, valves and fluid they are.
-        preset: name of the scheme.
-        spacing: of the particles, m; None: the grid's.
-        device: where particles live.
-        estimates: what ``geometry.estimated`` found of the recording, where that is known already.
-    """
-    scene = Scene.from_recording(recording, spacing, estimates=estimates)
-    scheme = scheme_preset(preset, **LONG_STEPS) if preset == "default" else scheme_preset(preset)
-    return Simulator(scene, scheme, device=device)
 
 
 def make_smoother(preset: str) -> regularize.Smoother:
@@ -91,7 +55,7 @@ def make_smoother(preset: str) -> regularize.Smoother:
     return regularize.Smoother.preset("thesis" if preset == "thesis" else "default")
 
 
-@checked(spacing=SPACING, members=between(1, MOST_MEMBERS))
+@checked(spacing=SPACING, members=between(1, MOST_MEMBERS), workers=between(1, MOST_WORKERS))
 def run_methods(
     measured: geometry.Recording,
     methods: Sequence[str],
@@ -111,6 +75,7 @@ def run_methods(
     progress: bool = False,
     quantities: Collection[str] = (),
     keep_members: Path | None = None,
+    workers: int | None = 1,
 ) -> dict[str, MethodResult]:
     """Run methods by name on one measurement, in the order of ``METHODS``.
 
@@ -122,53 +87,54 @@ def run_methods(
     methods whose members are read out ("ensemble", and "spline" by as many draws as members); ``keep_members`` is the
     file to which the ensemble's are written.
 
-    Under torchrun all processes share the splines and the ensemble; the first one runs "sph" meanwhile and the last
-    one "free". What the first one returns is complete.
+    ``workers`` processes of one thread each, this one among them, share the splines and the ensemble, with the same
+    result to the last bit for any number; "free" and "sph" have one each. None: as many as this process may use cores,
+    as the ensemble can give work to and as fit into the memory. Under torchrun its processes share the run in the same
+    way, and what the first one returns is complete.
 
     Raises:
         ValueError: an unknown method, "sph" on a measurement of components alone, or a checkpoint of another run.
         NotEnoughMemory: more would be needed than is free.
+        LostWorker: a worker was killed or has crashed.
     """
     _check(methods, measured)
     if not methods:
         return {}
-    smoother, timer = make_smoother(preset), _Timer()
-    prepared = PreparedMeasurement(measured, smoother, progress=progress)
-    models = _Models(prepared, preset, spacing, device)
+    prepared = PreparedMeasurement(measured, make_smoother(preset), progress=progress)
+    models = Models(prepared, preset, spacing, device)
     count = DEFAULT_MEMBERS if members is None else members
-    predicted_memory(prepared, methods, preset, models.spacing, count, also).refuse_beyond(free_memory())
-    ensemble = None
+    foretold, free = predicted_memory(prepared, methods, preset, models.spacing, count, also), free_memory()
+    options = EnsembleOptions(lag=lag, minimum_members=minimum_members)
+    tasks = parallel_tasks(measured.frames, methods, count, options.batch) if device == "cpu" else 1
+    processes = chosen_workers(workers, tasks, lambda number: foretold.in_processes(number).fits(free))
+    foretold.in_processes(processes).refuse_beyond(free)
+    run = MethodsRun(
+        measured,
+        prepared,
+        models,
+        methods,
+        also,
+        members=count,
+        options=options,
+        truth=truth,
+        checkpoints=None if checkpoints is None else Path(checkpoints),
+        resume=_read_once(resume, checkpoints),
+        seed=seed,
+        quantities=quantities,
+        keep_members=keep_members,
+        processes=processes,
+    )
+    run.refuse_foreign_checkpoint()
+    return spread(partial(run.results, watcher, progress), run.for_worker().results, processes)
+
+
+def parallel_tasks(
+    frames: int, methods: Sequence[str], members: int = DEFAULT_MEMBERS, batch: int = EnsembleOptions.batch
+) -> int:
+    """How many processes find work: on the members and the control, or on the splines where there are no members."""
     if "ensemble" in methods:
-        ensemble = _EnsembleCall(
-            prepared,
-            models,
-            also,
-            members=count,
-            options=EnsembleOptions(lag=lag, minimum_members=minimum_members),
-            truth=truth,
-            checkpoints=None if checkpoints is None else Path(checkpoints),
-            resume=_read_once(resume, checkpoints),
-            seed=seed,
-            quantities="ensemble" in quantities,
-            keep_members=keep_members,
-        )
-        ensemble.refuse_foreign_checkpoint()
-    smoothed = prepared.smoothed  # by all processes together
-    mended = {"estimates": found} if (found := prepared.splines.estimates.summary()) else {}
-    results: dict[str, MethodResult] = {}
-    if "spline" in methods:
-        drawn = _drawn(prepared, count, seed) if "spline" in quantities and is_lead() else None
-        results["spline"] = timer.result(with_pressure(smoothed, drawn), {"smoother": repr(smoother)} | mended, drawn)
-    if is_last() and set(methods) != {"spline"}:
-        free = run_freely(measured, models.coarse, smoothed.velocity[0], seed=seed, progress=progress)
-        results["free"] = timer.result(free)
-    if is_lead() and "sph" in methods:
-        run = filter_sph(prepared, models.coarse, seed=seed, progress=progress)
-        results["sph"] = timer.result(run.recording, run.info)
-    if ensemble is not None:
-        done, curves = ensemble.run(watcher, progress)
-        results["ensemble"] = timer.result(with_pressure(done.recording, curves), done.info | mended, curves)
-    return _collected(results)
+        return 1 + -(-members // batch)
+    return 2 if "sph" in methods else -(-frames // CHOICE_EVERY)
 
 
 def predicted_memory(
@@ -180,7 +146,7 @@ def predicted_memory(
     also: Sequence[geometry.Recording] = (),
 ) -> MemoryPrediction:
     """What ``run_methods`` with the same options will take."""
-    spacing = _spacing(prepared, spacing)
+    spacing = analysis_spacing(prepared, spacing)
     simulated = set(methods) - {"spline"}
     runs = [(spacing, 1)] if simulated else []
     if "ensemble" in methods:
@@ -204,93 +170,6 @@ def predicted_forecast_memory(
     return predicted(recording, scheme_preset(preset), spacings=[(spacing, 1)], copies=copies)
 
 
-def _spacing(prepared: PreparedMeasurement, asked: float | None) -> float:
-    """Of the particles of single runs and of the ensemble's members, m."""
-    return ANALYSIS_SPACING * min(prepared.recording.grid.spacing) if asked is None else asked
-
-
-class _Models:
-    """The simulators of a measurement, each made when it is first asked for."""
-
-    def __init__(self, prepared: PreparedMeasurement, preset: str, spacing: float | None, device: str) -> None:
-        self.prepared, self.preset, self.device = prepared, preset, device
-        self.spacing = _spacing(prepared, spacing)
-
-    @cached_property
-    def coarse(self) -> Simulator:
-        """Of single runs and of the ensemble's members."""
-        return self._at(self.spacing)
-
-    @cached_property
-    def fine(self) -> Simulator:
-        """Of the ensemble's control."""
-        return self._at(CONTROL_SHARE * self.spacing)
-
-    def _at(self, spacing: float) -> Simulator:
-        found = self.prepared.splines.estimates
-        return make_model(
-            self.prepared.recording, preset=self.preset, spacing=spacing, device=self.device, estimates=found
-        )
-
-
-@dataclass(frozen=True)
-class _EnsembleCall:
-    """An ensemble's run with all that it is to be told, before anything is computed."""
-
-    prepared: PreparedMeasurement
-    models: _Models
-    also: Sequence[geometry.Recording]
-    members: int
-    options: EnsembleOptions
-    truth: geometry.Recording | None
-    checkpoints: Path | None
-    resume: bool | Saved
-    seed: int
-    quantities: bool = False
-    keep_members: Path | None = None
-
-    def refuse_foreign_checkpoint(self) -> None:
-        """Tell another run's checkpoint before splines and free runs have taken their minutes."""
-        if not isinstance(self.resume, Saved):
-            return
-        key = ensemble_key(
-            [self.prepared, *(further(one, self.prepared) for one in self.also)],
-            self.models.fine,
-            self.models.coarse,
-            default_filter(self.prepared.recording, self.options),
-            self.options,
-            members=self.members,
-            seed=self.seed,
-            truth=self.truth,
-        )
-        self.resume.refuse_foreign(key)
-
-    def run(self, watcher: Watcher | None, progress: bool) -> tuple[EnsembleRun, MemberCurves | None]:
-        """The ensemble's analyses, and what its members give where it is asked for."""
-        quantities = MemberQuantities(self.prepared.recording, strict=False) if self.quantities else None
-        read: list[FrameObserver] = [] if quantities is None else [quantities]
-        if self.keep_members is not None:
-            read.append(MemberFile(self.keep_members, self.prepared.recording, self.members))
-        run = assimilate(
-            self.prepared,
-            self.models.fine,
-            coarse=self.models.coarse,
-            members=self.members,
-            options=self.options,
-            also=self.also,
-            truth=self.truth,
-            checkpoints=self.checkpoints,
-            resume=self.resume,
-            watcher=watcher,
-            seed=self.seed,
-            progress=progress,
-            observers=read,
-        )
-        if quantities is None or quantities.fault is not None or not is_lead():
-            return run, None
-        return run, quantities.found()
-
-
 def _check(methods: Sequence[str], measured: geometry.Recording) -> None:
     unknown = [name for name in methods if name not in METHODS]
     if unknown:
@@ -306,38 +185,7 @@ def _read_once(resume: bool | Saved, checkpoints: str | Path | None) -> bool | S
     return resume
 
 
-def _drawn(prepared: PreparedMeasurement, count: int, seed: int) -> MemberCurves:
-    """What draws from the splines' posterior give."""
-    amplitude = Amplitude(prepared.balance, prepared.amplitude_error, count, seed)
-    frames = spline_frames(prepared.splines, prepared.smoothed, count, seed=seed, amplitude=amplitude)
-    return quantified(prepared.smoothed, frames)
-
-
-def _collected(results: dict[str, MethodResult]) -> dict[str, MethodResult]:
-    """In the order of ``METHODS``, "free" from the process that ran it."""
-    free = from_last(results.get("free"))
-    known = results if free is None else results | {"free": free}
-    return {name: known[name] for name in METHODS if name in known}
-
-
-class _Timer:
-    """Seconds between the results of one run after another."""
-
-    def __init__(self) -> None:
-        self.began = clock.perf_counter()
-
-    def result(
-        self,
-        recording: geometry.Recording,
-        info: dict[str, Any] | None = None,
-        quantities: MemberCurves | None = None,
-    ) -> MethodResult:
-        ended = clock.perf_counter()
-        seconds, self.began = ended - self.began, ended
-        return MethodResult(recording, seconds, {} if info is None else info, quantities)
-
-
-@checked(every=between(1, 2**31), spacing=SPACING)
+@checked(every=between(1, 2**31), spacing=SPACING, workers=between(1, MOST_WORKERS))
 def forecast_skill(
     recording: geometry.Recording,
     leads: Sequence[float],
@@ -349,14 +197,42 @@ def forecast_skill(
     save: bool = False,
     progress: bool = False,
     seed: int = 0,
+    workers: int | None = 1,
 ) -> ForecastSkill:
     """Skill of the simulator on a recording; see ``skill``. ``spacing`` (m) defaults to the grid's.
 
+    ``workers`` processes of one thread each share the starts; see ``run_methods``.
+
     Raises:
         NotEnoughMemory: more would be needed than is free.
+        LostWorker: a worker was killed or has crashed.
     """
+    foretold = predicted_forecast_memory(recording, leads if save else (), preset, spacing)
+    free = free_memory()
+    tasks = len(starts(recording, leads, every)) if device == "cpu" else 1
+    processes = chosen_workers(workers, tasks, lambda number: foretold.in_processes(number).fits(free))
+    foretold.in_processes(processes).refuse_beyond(free)
+    work = partial(
+        _skill, recording, leads, every=every, preset=preset, spacing=spacing, device=device, save=save, seed=seed
+    )
+    result = spread(partial(work, progress=progress), work, processes)
+    return result if processes == 1 else replace(result, config=result.config | {"processes": processes})
+
+
+def _skill(
+    recording: geometry.Recording,
+    leads: Sequence[float],
+    *,
+    every: int,
+    preset: str,
+    spacing: float | None,
+    device: str,
+    save: bool,
+    seed: int,
+    progress: bool = False,
+) -> ForecastSkill:
+    """``forecast_skill`` as each of several processes calls it."""
     began = clock.perf_counter()
-    predicted_forecast_memory(recording, leads if save else (), preset, spacing).refuse_beyond(free_memory())
     model = make_model(recording, preset=preset, spacing=spacing, device=device)
     made = clock.perf_counter() - began
     result = skill(recording, model, leads, every=every, save=save, progress=progress, seed=seed)

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 import time as clock
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -20,6 +21,8 @@ from torchsph.simulator.grid_forecast import GridForecast, Transfer
 from torchsph.simulator.simulator import Simulator
 from torchsph.simulator.transfer.checks import check_grid
 
+from .runtime.parallel import advanced, shared
+
 
 @dataclass(frozen=True)
 class ForecastSkill:
@@ -27,7 +30,7 @@ class ForecastSkill:
 
     Attributes:
         leads: one entry per lead: ``{"lead": s, "starts": n, "nrmse": {"model": x, "persistence": y}}``.
-        seconds: ``{"setup": s, "forecast": s}``. config: what was run.
+        seconds: ``{"setup": s, "forecast": s}``, of all starts, whichever process ran them. config: what was run.
         recordings: the forecasts of each lead, valid at their time; empty unless they were asked for.
         info: accounts of the runs.
         failures: one entry per start that failed, in none of the errors: ``{"frame": n, "time": s, "reason": text}``.
@@ -41,27 +44,34 @@ class ForecastSkill:
     failures: list[dict[str, Any]] = field(default_factory=list)
 
 
-@dataclass
-class _Sums:
-    """Pooled squares of one lead: model error, persistence error, reference; and the number of starts."""
+class _Squares(NamedTuple):
+    """Sums of squares over the nodes of one start and lead: model error, persistence error, reference."""
 
-    model: float = 0.0
-    persistence: float = 0.0
-    reference: float = 0.0
-    starts: int = 0
+    model: float
+    persistence: float
+    reference: float
 
-    def add(self, forecast: np.ndarray, start: np.ndarray, truth: np.ndarray, both: np.ndarray) -> None:
-        def total(field: np.ndarray) -> float:
-            return float(np.sum(np.square(field[:, both], dtype=np.float64)))
 
-        self.model += total(forecast - truth)
-        self.persistence += total(start - truth)
-        self.reference += total(truth)
-        self.starts += 1
+@dataclass(frozen=True)
+class _Start:
+    """What the forecast from one frame gives.
 
-    def nrmse(self) -> dict[str, float]:
-        scale = self.reference if self.reference > 0 else math.nan
-        return {"model": math.sqrt(self.model / scale), "persistence": math.sqrt(self.persistence / scale)}
+    Attributes:
+        frame: from which it starts.
+        squares: of each lead.
+        fields: of each lead, where they are kept: the frame that it reaches, the forecast there (D, *shape), m/s, and
+            the nodes that it lacks.
+        seconds: it took.
+        totals: accounts of the run.
+        failure: why there is none of all this.
+    """
+
+    frame: int
+    squares: dict[float, _Squares] = field(default_factory=dict)
+    fields: dict[float, tuple[int, np.ndarray, int]] = field(default_factory=dict)
+    seconds: dict[str, float] = field(default_factory=lambda: {"setup": 0.0, "forecast": 0.0})
+    totals: dict[str, float] = field(default_factory=dict)
+    failure: str | None = None
 
 
 @checked(every=between(1, 2**31))
@@ -94,33 +104,35 @@ def skill(
         raise ValueError(f"leads must not be negative (s), and every at least 1, got {list(leads)} and {every}")
     if transfer is None:
         transfer = Transfer() if recording.weight is None else Transfer(fade=None)
-    targets = _targets(recording, leads, every)
-    sums = {lead: _Sums() for lead in leads}
-    kept: dict[float, list[tuple[int, np.ndarray, int]]] = {lead: [] for lead in leads}
-    seconds = {"setup": 0.0, "forecast": 0.0}
-    totals: dict[str, float] = {}
-    failures: list[dict[str, Any]] = []
-    bar = tqdm(sorted(targets), desc="forecast", unit="start", disable=None if progress else True)
-    for start in bar:
-        try:
-            forecasts = _from_one_start(recording, model, start, targets[start], transfer, seed, seconds, totals)
-        except NumericalFailure as fault:
-            failures.append({"frame": start, "time": float(recording.time[start]), "reason": str(fault)})
-            continue
-        for lead, (frame, value, missing) in forecasts.items():
-            _compare(recording, start, frame, value, sums[lead])
-            if save:
-                kept[lead].append((frame, value.astype(np.float32), missing))
-    if len(failures) == len(targets):
-        raise NumericalFailure(f"all {len(failures)} starts failed, the first: {failures[0]['reason']}")
-    rows = [{"lead": lead, "starts": sums[lead].starts, "nrmse": sums[lead].nrmse()} for lead in leads]
+    targets = starts(recording, leads, every)
+    with tqdm(total=len(targets), desc="forecast", unit="start", disable=None if progress else True) as bar:
+        tasks = [
+            partial(_from_one_start, recording, model, start, frames, transfer, seed, save, partial(advanced, bar))
+            for start, frames in sorted(targets.items())
+        ]
+        found = shared(tasks)
+    failed = [one for one in found if one.failure is not None]
+    if len(failed) == len(found):
+        raise NumericalFailure(f"all {len(failed)} starts failed, the first: {failed[0].failure}")
+    failures = [{"frame": one.frame, "time": float(recording.time[one.frame]), "reason": one.failure} for one in failed]
+    rows = [_row(lead, [one.squares[lead] for one in found if lead in one.squares]) for lead in leads]
+    kept = {lead: [one.fields[lead] for one in found if lead in one.fields] for lead in leads}
     saved = {lead: _as_recording(recording, frames, lead) for lead, frames in kept.items() if frames}
+    totals: dict[str, float] = {}
+    for one in found:
+        for name, total in one.totals.items():
+            totals[name] = totals.get(name, 0) + total
+    seconds = {name: sum(one.seconds[name] for one in found) for name in ("setup", "forecast")}
     config = {"spacing": model.scene.spacing, "scheme": repr(model.scheme), "transfer": repr(transfer)}
     return ForecastSkill(rows, seconds, config, saved, totals, failures)
 
 
-def _targets(recording: geometry.Recording, leads: Sequence[float], every: int) -> dict[int, dict[float, int]]:
-    """Frame of each lead for every start that has at least one."""
+def starts(recording: geometry.Recording, leads: Sequence[float], every: int) -> dict[int, dict[float, int]]:
+    """Frame of each lead for every start that has at least one.
+
+    Raises:
+        ValueError: no frame lies a lead after a start.
+    """
     found: dict[int, dict[float, int]] = {}
     for start in range(0, recording.frames, every):
         for lead in leads:
@@ -140,11 +152,31 @@ def _from_one_start(
     frames: dict[float, int],
     transfer: Transfer,
     seed: int,
-    seconds: dict[str, float],
-    totals: dict[str, float],
-) -> dict[float, tuple[int, np.ndarray, int]]:
-    """For each lead the frame that it reaches, the forecast there (D, *shape), m/s, and the nodes that it lacks."""
-    began = clock.perf_counter()
+    save: bool,
+    done: Callable[[], object],
+) -> _Start:
+    """The forecast from one frame to the frame of each lead; ``done`` is called at its end."""
+    found = _Start(start)
+    try:
+        _forecast(recording, model, frames, transfer, seed, save, found)
+    except NumericalFailure as fault:
+        return _Start(start, seconds=found.seconds, failure=str(fault))
+    finally:
+        done()
+    return found
+
+
+def _forecast(
+    recording: geometry.Recording,
+    model: Simulator,
+    frames: dict[float, int],
+    transfer: Transfer,
+    seed: int,
+    save: bool,
+    found: _Start,
+) -> None:
+    """Put into ``found`` what a forecast gives at each lead."""
+    began, start = clock.perf_counter(), found.frame
     velocity, mask = recording.velocity, np.array(recording.mask, bool)
     known = torch.from_numpy(mask[start] & np.isfinite(velocity[start]).all(0))
     model.domain.prepare_until(float(recording.time[start]), float(recording.time[max(frames.values())]))
@@ -157,17 +189,16 @@ def _from_one_start(
         transfer,
         seed=seed,
     )
-    seconds["setup"] += clock.perf_counter() - began
-    found = {}
+    found.seconds["setup"] += clock.perf_counter() - began
     for lead, frame in sorted(frames.items()):
         began = clock.perf_counter()
         value, covered = going.at(float(recording.time[frame]), torch.from_numpy(mask[frame]).to(model.device))
-        missing = int((mask[frame] & ~covered[0].cpu().numpy()).sum())
-        found[lead] = (frame, value[0].cpu().numpy(), missing)
-        seconds["forecast"] += clock.perf_counter() - began
-    for name, total in going.run.record.totals().items():
-        totals[name] = totals.get(name, 0) + total
-    return found
+        field, missing = value[0].cpu().numpy(), int((mask[frame] & ~covered[0].cpu().numpy()).sum())
+        found.seconds["forecast"] += clock.perf_counter() - began
+        found.squares[lead] = _squares(recording, start, frame, field)
+        if save:
+            found.fields[lead] = (frame, field.astype(np.float32), missing)
+    found.totals.update(going.run.record.totals())
 
 
 def _filled(recording: geometry.Recording, frame: int) -> np.ndarray:
@@ -175,10 +206,23 @@ def _filled(recording: geometry.Recording, frame: int) -> np.ndarray:
     return np.where(np.array(recording.mask[frame], bool), np.nan_to_num(recording.velocity[frame]), 0.0)
 
 
-def _compare(recording: geometry.Recording, start: int, frame: int, value: np.ndarray, sums: _Sums) -> None:
-    """Add a forecast (D, *shape) and persistence against what a frame holds, where both frames know the blood."""
+def _squares(recording: geometry.Recording, start: int, frame: int, forecast: np.ndarray) -> _Squares:
+    """Of a forecast (D, *shape) and of persistence against what a frame holds, where both frames know the blood."""
     both = np.array(recording.mask[start], bool) & np.array(recording.mask[frame], bool)
-    sums.add(value, _filled(recording, start), _filled(recording, frame), both)
+    first, truth = _filled(recording, start), _filled(recording, frame)
+
+    def total(field: np.ndarray) -> float:
+        return float(np.sum(np.square(field[:, both], dtype=np.float64)))
+
+    return _Squares(total(forecast - truth), total(first - truth), total(truth))
+
+
+def _row(lead: float, squares: Sequence[_Squares]) -> dict[str, Any]:
+    """The errors of a lead, pooled over its starts."""
+    model, persistence, reference = (sum(column) for column in zip(*squares, strict=True)) if squares else (0.0,) * 3
+    scale = reference if reference > 0 else math.nan
+    nrmse = {"model": math.sqrt(model / scale), "persistence": math.sqrt(persistence / scale)}
+    return {"lead": lead, "starts": len(squares), "nrmse": nrmse}
 
 
 def _as_recording(

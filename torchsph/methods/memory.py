@@ -8,7 +8,7 @@ of a wall's table costs was measured on the CPU: within a quarter of what runs t
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -32,6 +32,7 @@ _PER_PARTICLE = {2: 1_000, 3: 3_000}  # bytes of state, neighbours and sums
 _TABLES_KEPT, _TABLE_MEMORY = 24, 1 << 29  # as `simulator.walls.fields` keeps them
 _SETS_OF_OPENINGS = 2  # tables for each key time: valves open and close in between
 _TABLES_IN_MAKING = 3  # what transforms and distances take while one is made
+_PROGRAM = 250 << 20  # a worker with all that it has imported, before its work
 _LIBRARIES = 36 << 20  # what is loaded at the first fit and the first step
 _COPIES_OF_RECORDING, _COPIES_OF_MEMBERS = 10, 6
 
@@ -51,6 +52,7 @@ class MemoryPrediction:
         members: grid fields of the ensemble.
         recordings: the measurement's arrays and those of the results.
         released: part of the splines' that is free again for particles and tables.
+        processes: that share the run.
     """
 
     splines: int
@@ -59,12 +61,22 @@ class MemoryPrediction:
     members: int
     recordings: int
     released: int = 0
+    processes: int = 1
 
     @property
     def total(self) -> int:
         """Bytes."""
         simulated = max(0, self.particles + self.tables - self.released)
-        return _LIBRARIES + self.splines + simulated + self.members + self.recordings
+        each = _LIBRARIES + self.splines + simulated + self.members + self.recordings
+        return self.processes * each + (self.processes - 1) * _PROGRAM
+
+    def in_processes(self, count: int) -> MemoryPrediction:
+        """At most what it takes in so many processes: any of them may come to hold all that one alone does."""
+        return replace(self, processes=count)
+
+    def fits(self, free: int | None) -> bool:
+        """Whether so many bytes are enough; where nobody knows how many are free, they are."""
+        return free is None or self.total <= free
 
     def refuse_beyond(self, free: int | None) -> None:
         """Refuse a run that does not fit.
@@ -75,13 +87,15 @@ class MemoryPrediction:
         Raises:
             NotEnoughMemory: it needs more.
         """
-        if free is None or self.total <= free:
+        if self.fits(free) or free is None:
             return
         parts = {name: size for name, size in vars(self).items() if size > 0 and name in _CURES}
         largest = max(parts, key=lambda name: parts[name])
         told = ", ".join(f"{name} {_size(size)}" for name, size in sorted(parts.items(), key=lambda one: -one[1]))
+        shared = f" in each of {self.processes} processes" if self.processes > 1 else ""
+        cure = "try fewer --workers" if self.processes > 1 else _CURES[largest]
         raise NotEnoughMemory(
-            f"needs about {_size(self.total)} of memory ({told}), but only {_size(free)} are free; {_CURES[largest]}"
+            f"needs about {_size(self.total)} of memory ({told}{shared}), but only {_size(free)} are free; {cure}"
         )
 
 

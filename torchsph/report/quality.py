@@ -160,7 +160,11 @@ def _findings(measured: geometry.Recording) -> Iterator[Check]:
     wrapped = [one for one in found if "wrapped" in one.rule]
     if not wrapped:
         means = "speeds beyond a scanner's limit come back with the wrong sign"
-        yield Check("Aliasing", GOOD, "no jump of twice a common limit between neighbours", means)
+        limit = measured.nyquist
+        text = "no jump of twice a common limit between neighbours"
+        if limit is not None:
+            text = f"wraps at {limit.min():.3g} m/s, which is known and was taken back"
+        yield Check("Aliasing", GOOD, text, means)
     for one in wrapped:
         yield Check("Aliasing", POOR, one.rule, one.cure)
     for one in found:

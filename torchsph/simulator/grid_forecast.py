@@ -13,6 +13,7 @@ from geometry.arguments import checked
 from torchsph.pairs.moving_least_squares import Fetched
 
 from .simulator import Simulation, Simulator
+from .transfer.carried_detail import CarriedDetail
 from .transfer.checks import check_grid
 
 
@@ -24,12 +25,13 @@ class Transfer:
     Attributes:
         fade: time (s) over which the correction below fades, or None for the plain fetch. Imposing and fetching
             loses detail that the particles cannot carry; the forecast is the fetched field plus that loss (initial
-            grid minus the field fetched at once), times exp(-lead / fade). For noisy input use None: the loss is noise.
+            grid minus the field fetched at once), brought along with fluid and walls (``CarriedDetail``), times
+            exp(-lead / fade). For noisy input use None: the loss is noise.
         projections: how often the imposed velocities are projected on fields without divergence before the first step;
             needs complete-kernel walls, and is left out with others.
     """
 
-    fade: float | None = 0.015
+    fade: float | None = 0.03
     projections: int = 2
 
     def __post_init__(self) -> None:
@@ -82,7 +84,7 @@ class GridForecast:
         self.shock = torch.full((len(batched),), math.nan, dtype=torch.float64)
         if transfer.projections and self.run.can_project:
             self.shock = self.run.project(transfer.projections).cpu()
-        self._lost: Tensor | None = None
+        self._lost: CarriedDetail | None = None
         self._ends: list[tuple[float, Fetched]] | None = [] if rates else None  # the start and the last fetch
         if transfer.fade is None and self._ends is None:
             return
@@ -91,7 +93,9 @@ class GridForecast:
             self._ends = [(time, Fetched(kept.value, mask & kept.covered))]
         if transfer.fade is not None:
             known = mask & kept.covered
-            self._lost = torch.where(known[:, None], batched.to(kept.value) - kept.value, torch.zeros_like(kept.value))
+            lost = torch.where(known[:, None], batched.to(kept.value) - kept.value, torch.zeros_like(kept.value))
+            self._lost = CarriedDetail(grid, lost, known.all(0), model.scene.walls, time)
+            self.run.follow()
 
     @checked
     def at(self, time: float, mask: Tensor) -> tuple[Tensor, Tensor]:
@@ -106,7 +110,8 @@ class GridForecast:
         if self._lost is None or self.transfer.fade is None:
             return found.value, found.covered
         fading = math.exp(-(time - self.start_time) / self.transfer.fade)
-        return found.value + fading * self._lost * found.covered[:, None], found.covered
+        lost = self._lost.at(time, self.run.travelled(self.grid, mask).value, mask)
+        return found.value + fading * lost * found.covered[:, None], found.covered
 
     def rate(self) -> Tensor:
         """Mean du/dt from the start to the last `at` (members, D, *shape), m/s^2; not a number where one is unknown.

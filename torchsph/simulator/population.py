@@ -111,12 +111,12 @@ class Population:
         total = mass[first] + mass[second]
         part = mass[second] / total
         changes = {"mass": mass.index_copy(0, first, total)}
-        for name in ("position", "velocity", "deviation", "pressure", "confidence"):
+        for name in ("position", "velocity", "deviation", "pressure", "confidence", "origin"):
             value = getattr(particles, name)
             if value is None:
                 continue
             difference = value[second] - value[first]
-            if name == "position":
+            if name in ("position", "origin"):
                 difference = nearest_image(difference, self.domain.period)
             weight = part.reshape(-1, *[1] * (value.ndim - 1))
             changes[name] = value.index_copy(0, first, value[first] + weight * difference)
@@ -209,10 +209,12 @@ class Population:
             weight=particles.mass,
         )
 
-    @staticmethod
-    def _fields(particles: Particles) -> Tensor:
+    def _fields(self, particles: Particles) -> Tensor:
         """What new particles are given by interpolation, (N, C): mass, deviation, velocity, and what else there is."""
         more = [value for value in (particles.pressure, particles.confidence) if value is not None]
+        if particles.origin is not None:
+            travelled = nearest_image(particles.position - particles.origin, self.domain.period)
+            more = [*travelled.unbind(1), *more]
         return torch.stack([particles.mass, particles.deviation, *particles.velocity.unbind(1), *more], 1)
 
     def _taken(self, particles: Particles, row: Tensor, place: Tensor, member: Tensor, around: Moments) -> Particles:
@@ -239,7 +241,9 @@ class Population:
             mass=particles.mass.index_copy(0, row, particles.mass[row] * kept),
             velocity=particles.velocity.index_copy(0, row, particles.velocity[row] + given[:, 1:] / kept[:, None]),
         )
-        rest = iter(value[:, 2 + dimension :].unbind(1))
+        rest, origin = iter(value[:, 2 + dimension :].unbind(1)), None
+        if particles.origin is not None:
+            origin = place - torch.stack([next(rest) for _ in range(dimension)], 1)
         return paid.joined(
             Particles(
                 place,
@@ -251,6 +255,7 @@ class Population:
                 particles.members,
                 pressure=None if particles.pressure is None else next(rest),
                 confidence=None if particles.confidence is None else next(rest).clamp_min(0.0),
+                origin=origin,
             )
         )
 

@@ -211,6 +211,7 @@ class Scene:
         period: lengths (D,) of a periodic box that starts at the origin, m; None entries are not periodic.
         reference_speed: largest speed that is expected, m/s; it sets the internal units and the default sound speed.
         dimension: 2 or 3.
+        cut: of a plane, whether it is cut out of a flow in space: its velocities keep the divergence that is imposed.
     """
 
     spacing: float
@@ -221,6 +222,7 @@ class Scene:
     period: tuple[float | None, ...] | None = None
     reference_speed: float = 1.0
     dimension: int = 3
+    cut: bool = False
 
     def __post_init__(self) -> None:
         if not isinstance(self.valves, tuple | list) or not all(isinstance(one, Valve) for one in self.valves):
@@ -232,6 +234,8 @@ class Scene:
             raise ValueError(f"Scene.spacing must be positive and finite (m), got {self.spacing}")
         if self.dimension not in (2, 3):
             raise ValueError(f"Scene.dimension must be 2 or 3, got {self.dimension}")
+        if self.cut and self.dimension != 2:
+            raise ValueError("Scene.cut is of planes: a flow in space has nothing that passes through it")
         if not 0 < self.reference_speed < math.inf:
             raise ValueError(f"Scene.reference_speed must be positive and finite (m/s), got {self.reference_speed}")
         exact = [valve.flux is not None and not valve.flux_sigma for valve in self.valves]
@@ -331,6 +335,7 @@ class Scene:
             walls=geometry.WallMotion.from_recording(recording),
             valves=valves,
             dimension=recording.dimension,
+            cut=recording.cut,
         )
 
 

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from geometry import Grid
 from geometry.arguments import checked
+from torchsph.pairs.cell_search import nearest_image
 from torchsph.pairs.moving_least_squares import Fetched
 
 from .advancing import AdvancingRun
@@ -173,6 +174,25 @@ class Simulation(AdvancingRun):
         moved = pulled(points, p.velocity * self.units.speed, grid, target, gain, weight) / self.units.speed
         self.particles = p.changed(velocity=torch.where(p.inside[:, None], moved, p.velocity))
 
+    def follow(self) -> None:
+        """Remember where every particle is now: ``travelled`` tells later how far the fluid has come."""
+        self.particles = replace(self.particles, origin=self.particles.position.clone())
+
+    @checked
+    def travelled(self, grid: Grid, mask: Tensor) -> Fetched:
+        """How far the fluid at the nodes where ``mask`` (*shape) has come since ``follow``; as ``fetch``, but m.
+
+        Raises:
+            RuntimeError: nobody has begun to follow the particles.
+            TypeError: a mask that is not bool.
+            ValueError: another dimension or shape than the run's and the grid's.
+        """
+        p = self.particles
+        if p.origin is None:
+            raise RuntimeError("nobody follows the particles: call follow() where their way is to begin")
+        way = nearest_image(p.position - p.origin, self.domain.period) * (self.units.length / self.units.speed)
+        return self._fetched(p.changed(velocity=way), grid, mask)
+
     @checked
     def fetch(self, grid: Grid, mask: Tensor) -> Fetched:
         """Velocities at the nodes where ``mask`` (*shape): value (members, D, *shape), covered (members, *shape).
@@ -183,6 +203,10 @@ class Simulation(AdvancingRun):
             TypeError: a mask that is not bool.
             ValueError: another dimension or shape than the run's and the grid's.
         """
+        return self._fetched(self.particles, grid, mask)
+
+    def _fetched(self, particles: Particles, grid: Grid, mask: Tensor) -> Fetched:
+        """What particles of this moment carry in place of velocities, at the nodes of a mask."""
         check_grid(grid, self.domain.scene.dimension)
         check_mask(mask, grid)
         nearest = None
@@ -190,4 +214,4 @@ class Simulation(AdvancingRun):
             if not self.surroundings.entered:
                 self.surroundings.enter(self.time, self.time)
             nearest = self.surroundings.nearest_fluid
-        return fetch_on_grid(self.particles, grid, mask, self.units, self._backend, self.domain.period, nearest)
+        return fetch_on_grid(particles, grid, mask, self.units, self._backend, self.domain.period, nearest)

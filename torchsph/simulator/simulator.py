@@ -54,6 +54,10 @@ class Simulator:
         object.__setattr__(self, "scheme", scheme)
         if self.dtype not in (torch.float32, torch.float64):
             raise ValueError(f"Simulator.dtype must be torch.float32 or torch.float64, got {self.dtype}")
+        if self.scene.cut and scheme.compressible:
+            raise ValueError(
+                "a plane that is cut out of a flow in space needs the incompressible scheme (preset 'default')"
+            )
         object.__setattr__(self, "device", usable_device(self.device))
         choose_backend(self.backend, self.device)  # a missing backend must not surface in the middle of a run
         units = Units(self.scene.spacing, self.scene.reference_speed)

@@ -14,6 +14,7 @@ from .domain import Domain
 from .state.clock import Clock
 from .state.particles import Particles
 from .state.record import Record
+from .transfer.exchange import Exchange
 from .transfer.imposing import fill_beyond
 from .walls.compiled import near_wall
 from .walls.fields import STRAY
@@ -34,12 +35,14 @@ class PresentSurroundings:
         valve_strength: of the run, a number or (members,); what is entered from now on goes by it.
         valve_acceleration: (N, D), the last one by pressure sources, internal, for the account of their work; None
             while all valves are shut.
+        exchange_field: what comes in through a plane cut out of a flow, as the last imposed field has it, or None.
     """
 
     def __init__(self, domain: Domain) -> None:
         self.domain, self.clock = domain, Clock(domain.device)
         self.valve_strength: float | Tensor = 1.0
         self.valve_acceleration: Tensor | None = None
+        self.exchange_field: Exchange | None = None
         self._bracket: tuple[float, float] = (0.0, 1.0)
         self._keys: tuple[Tensor, Tensor] | None = None
         self._fields: LookUp | None = None
@@ -72,6 +75,10 @@ class PresentSurroundings:
     def later(self, particles: Particles, step: Tensor) -> Particles:
         """Go on by ``step`` (members,), internal; the particles with what buffers do at that time."""
         self.at(self.clock.of_members(particles.members) + step.double() * self.domain.units.time)
+        if self.exchange_field is not None:
+            if not self.clock.open_regions:  # nothing else can fill the walls
+                self.exchange_field.wanted = self._area_rate(particles)
+            particles = self.exchange_field.carried(particles)
         return self.domain.valves.driven(particles, self.clock)
 
     def sample(self, particles: Particles) -> WallSample | None:
@@ -226,12 +233,38 @@ class PresentSurroundings:
         particles = domain.valves.opened(particles, self.clock)
         points = domain.valves.imposing_points(particles, self.clock)
         particles = particles.changed(velocity=self._sampled(particles, grid, fields, points))
+        if domain.scene.cut:
+            particles = self._exchanging(particles, grid, fields, mask.to(domain.device))
         splits = domain.valves.split_points(self.clock)
         if splits is not None:
-            at = [grid.sample(field, splits * domain.units.length).T for field in fields]
-            read = torch.stack(at) / domain.units.speed
+            read = self._at_points(grid, fields, splits)
             domain.valves.note_split(read.expand(particles.members, -1, -1), self.clock)
         return domain.valves.driven(particles, self.clock, channel=True)
+
+    def _exchanging(self, particles: Particles, grid: Grid, fields: Tensor, mask: Tensor) -> Particles:
+        """Particles of a plane cut out of a flow, with what comes in through it by the fields (B, D, *shape), m/s.
+
+        Together that is what the walls' area takes in and the openings in the plane do not pass.
+        """
+        domain, wanted = self.domain, self._area_rate(particles)
+        points = domain.valves.open_points(self.clock)
+        if wanted is not None and points is not None:
+            wanted = wanted - domain.valves.through_open(self._at_points(grid, fields, points), self.clock)
+        self.exchange_field = Exchange(grid, fields, mask, domain.units, domain.scene.spacing, wanted)
+        return self.exchange_field.carried(particles)
+
+    def _area_rate(self, particles: Particles) -> Tensor | None:
+        """Change of the area within the walls, internal, of each member (members,); None without walls."""
+        walls, units = self.domain.walls, self.domain.units
+        if walls is None:
+            return None
+        change = walls.motion.volume_rate(self.clock.first) * units.time / units.length**walls.motion.dimension
+        return torch.full((particles.members,), change, dtype=self.domain.dtype, device=self.domain.device)
+
+    def _at_points(self, grid: Grid, fields: Tensor, points: Tensor) -> Tensor:
+        """(B, n, D), internal, of fields (B, D, *shape), m/s, at points (n, D), internal."""
+        place, speed = points * self.domain.units.length, self.domain.units.speed
+        return torch.stack([grid.sample(field, place).T for field in fields]) / speed
 
     def _walls_in_metres(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Distance (n,), positive in the fluid, and velocity (n, D), m/s, of the walls at points (n, D) float64, m."""

@@ -15,6 +15,7 @@ from .estimation.doppler import ColourDoppler, DopplerEstimates, colour_doppler,
 from .estimation.estimates import Estimates, Flag
 from .estimation.plugin import LibraryTracker, Tracker
 from .estimation.tracking import SpeckleTracker, track
+from .measurements.aliasing import aliased
 from .measurements.calibration import Calibration, fit_calibration
 from .measurements.doppler import DopplerOptions, measure_doppler
 from .measurements.noise import NoiseModel, measure_noise
@@ -62,6 +63,7 @@ __all__ = [
     "TrackingPlan",
     "TrainingPlan",
     "UffVolumes",
+    "aliased",
     "baseband",
     "calibrate",
     "colour_doppler",

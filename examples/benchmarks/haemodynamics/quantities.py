@@ -1,13 +1,14 @@
 """What people read out of a flow, against a truth: raw, splines, ensemble, members, and the formulas alone.
 
-    torchsph assimilate MEASURED.h5 --method spline,ensemble --keep-members --out RUN
+    torchsph assimilate MEASURED.h5 --method spline,ensemble [--keep-members] --out RUN
     python examples/benchmarks/haemodynamics/quantities.py TRUTH.h5 MEASURED.h5 RUN [--tracers 20000] [--json FILE]
 
 Curves: root mean square error over the root mean square of the true curve. The truth is these formulas on all frames of
 the true velocities; for all that is of the pressure it is the CFD's own. "formula" is the formulas on the true
 velocities at the measurement's frames: what they cost by themselves. "members" is the mean over the ensemble's members,
 whose du/dt comes from their forecasts; "simulator" the projection's pressure. Coverage: share of frames that the
-members' 90 % band holds.
+members' 90 % band holds. Members are those of `members.h5` where they were kept, else what `quantities.json` says of
+them, which leaves out their fields of pressure.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ import math
 import sys
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[3]))
 
@@ -26,6 +27,7 @@ import numpy as np
 import torch
 
 import geometry
+from examples.provenance import ANALYSES, write_table
 from torchsph.evaluation.frames import matching_frames
 from torchsph.evaluation.metrics import filled_velocity
 from torchsph.haemodynamics import (
@@ -34,6 +36,7 @@ from torchsph.haemodynamics import (
     FrameQuantities,
     MovingFlow,
     MovingWalls,
+    Summary,
     beat_numbers,
     coverage,
     flow_components,
@@ -43,6 +46,8 @@ from torchsph.haemodynamics import (
 )
 from torchsph.haemodynamics.flow_rate import peaks
 from torchsph.methods.members.kept import read_members
+
+SOURCES = ("examples/benchmarks/haemodynamics/quantities.py", "torchsph/haemodynamics", *ANALYSES)
 
 Curves = dict[str, np.ndarray]
 
@@ -127,10 +132,15 @@ def components(recording: geometry.Recording, velocity: np.ndarray, walls: Movin
     return [found.direct, found.retained, found.delayed, found.residual]
 
 
-def members_of(
-    run: Path, analysis: geometry.Recording, frames: list[FrameQuantities]
-) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """Curves of all members `(N, T)`, and fields of the pressure `(T, *shape)` by what they are made of."""
+class Members(NamedTuple):
+    """Bands of the curves of all members, and fields of the pressure `(T, *shape)` by what they are made of."""
+
+    bands: dict[str, Summary]
+    pressures: dict[str, np.ndarray]
+
+
+def kept_members(run: Path, analysis: geometry.Recording, frames: list[FrameQuantities]) -> Members:
+    """Read out of the members themselves."""
     curves, pressures = [], []
     for frame in read_members(run / "members.h5", analysis):
         velocity = np.concatenate([frame.field[None], frame.members])
@@ -142,7 +152,19 @@ def members_of(
         pressures.append((made.pressure[0], made.pressure[1:].mean(0), own))
     fields = zip(("forecast rates", "members", "simulator"), zip(*pressures, strict=True), strict=True)
     stacked = {name: np.stack([one[name] for one in curves], axis=1) for name in UNITS}
-    return stacked, {name: np.stack(parts) for name, parts in fields}
+    return Members(
+        {name: summary(values) for name, values in stacked.items()}, {name: np.stack(parts) for name, parts in fields}
+    )
+
+
+def noted_members(run: Path, analysis: geometry.Recording, own: np.ndarray) -> Members:
+    """What the run noted of them; where the simulator gives no pressure, the formula's `own` stands in."""
+    noted = json.loads((run / "quantities.json").read_text(encoding="utf-8"))["members"]["curves"]
+    bands = {
+        name: Summary(*(np.array(curve[part], np.float64) for part in Summary._fields)) for name, curve in noted.items()
+    }
+    found = np.asarray(analysis.pressure, np.float64)
+    return Members(bands, {"simulator": np.where(np.isfinite(found), found, own)})
 
 
 class Comparison:
@@ -167,8 +189,11 @@ class Comparison:
         fields = {name: one.pressure for name, one in sources.items()}
         curves = {name: one.curves for name, one in sources.items()}
         curves["with variance"] = Fields(self.ensemble, frames, own_sigma=True).curves
-        members, more = members_of(self.run, self.ensemble, frames)
-        bands, fields = {name: summary(values) for name, values in members.items()}, fields | more
+        if (self.run / "members.h5").is_file():
+            bands, more = kept_members(self.run, self.ensemble, frames)
+        else:
+            bands, more = noted_members(self.run, self.ensemble, fields["ensemble"])
+        fields |= more
         curves["members"] = {name: band.mean for name, band in bands.items()}
         spins = {name: field_error(one.vorticity, whole.vorticity[self.chosen], mask) for name, one in sources.items()}
         return {
@@ -177,7 +202,7 @@ class Comparison:
                 "vorticity": spins,
                 "pressure": {name: field_error(one, pressure, mask, centred=True) for name, one in fields.items()},
             },
-            **self._differences(frames, all_frames, fields, right["pressure_difference"]),
+            **self._differences(frames, all_frames, fields, bands["pressure_difference"].mean),
             "numbers": self._numbers(whole.curves, curves),
             "coverage": {name: coverage(bands[name], right[name]) for name in UNITS if name != "volume"},
         }
@@ -187,14 +212,17 @@ class Comparison:
         frames: list[FrameQuantities],
         all_frames: list[FrameQuantities],
         fields: dict[str, np.ndarray],
-        right: np.ndarray,
+        members: np.ndarray,
     ) -> dict[str, Any]:
         """Base less apex: error and correlation of the curve, and how far the peaks of E and A are off."""
         domain, differences, apart = frames[0].domain, {}, {}
         fills = next((row[1], row[2]) for row in domain.intervals if int(row[0]) == domain.inlet)
         reference = waves(self.every.time, drops(all_frames, np.asarray(self.every.pressure)), fills)
-        for name, field in fields.items():
-            curve = drops(frames, field)
+        right = drops(frames, np.asarray(self.true.pressure, np.float64))
+        for name, curve in {
+            **{name: drops(frames, field) for name, field in fields.items()},
+            "members": members,
+        }.items():
             correlation = float(np.corrcoef(curve, right)[0, 1])
             differences[name] = {"error": off(curve, right), "correlation": correlation}
             late = 1e3 * (np.array(waves(self.true.time, curve, fills)) - reference)
@@ -226,7 +254,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("truth", type=Path)
     parser.add_argument("measured", type=Path)
-    parser.add_argument("run", type=Path, help="with spline.h5, ensemble.h5 and members.h5")
+    parser.add_argument("run", type=Path, help="with spline.h5, ensemble.h5, and members.h5 or quantities.json")
     parser.add_argument("--tracers", type=int, default=20_000)
     parser.add_argument("--only", choices=("fields", "components"), help="one half, beside the other in the JSON file")
     parser.add_argument("--json", type=Path, help="results file, read and updated")
@@ -241,7 +269,7 @@ def main() -> None:
         result |= given.components(options.tracers)
     show(result)
     if options.json is not None:
-        options.json.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+        write_table(options.json, result, SOURCES)
 
 
 def show(result: dict[str, Any]) -> None:

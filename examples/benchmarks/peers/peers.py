@@ -36,6 +36,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[3]))
 import numpy as np
 import torch
 
+from examples.provenance import MODEL, write_table
 from torchsph import Simulator, WeaklyCompressible
 from torchsph.validation.dam_breaks import (
     GRAVITY,
@@ -47,6 +48,8 @@ from torchsph.validation.dam_breaks import (
 )
 from torchsph.validation.exact_flows import FREE_SURFACE_OPTIONS
 from torchsph.validation.free_surface import resting_block
+
+SOURCES = ("examples/benchmarks/peers/peers.py", *MODEL)
 
 # t sqrt(2 g / a) of the last measured point before the far wall; when the front hits it, PySPH's example becomes
 # unstable at 0.02 m (and later ends in a segmentation fault)
@@ -166,7 +169,7 @@ def main() -> None:
     print(f"{options.threads} threads each, load of the machine: {load:.2f}")
     if options.json:
         report = {"rows": rows, "spacing_m": spacing, "threads": options.threads, "load": load}
-        options.json.write_text(json.dumps(report, indent=1) + "\n")
+        write_table(options.json, report, SOURCES)
 
 
 if __name__ == "__main__":

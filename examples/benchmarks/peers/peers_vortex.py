@@ -27,9 +27,12 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[3]))
 
 import torch
 
+from examples.provenance import MODEL, write_table
 from torchsph import Seeding
 from torchsph.validation import exact_flows as validation
 from torchsph.validation.runs import taylor_green, taylor_green_error
+
+SOURCES = ("examples/benchmarks/peers/peers_vortex.py", *MODEL)
 
 DECAY_TIME = 100 / (8 * math.pi**2)
 SCHEMES = {"EDAC": ["--scheme", "edac"], "delta-SPH": ["--scheme", "wcsph", "--delta-sph"]}
@@ -110,7 +113,7 @@ def main() -> None:
         print(f"{row['code']:<18} {start:<9} {row['error']:>8.4f} {row['cpu_s']:>7.1f} {row['wall_s']:>7.1f}")
     if options.json:
         report = {"rows": rows, "resolution": resolution, "load": os.getloadavg()[0]}
-        options.json.write_text(json.dumps(report, indent=1) + "\n")
+        write_table(options.json, report, SOURCES)
 
 
 if __name__ == "__main__":

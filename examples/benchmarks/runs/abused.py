@@ -88,6 +88,7 @@ def shapes(folder: Path) -> dict[str, Call]:
             geometry.winding_number,
             {"vertices": body.vertices, "faces": body.faces, "points": points.numpy()},
         ),
+        "unwrap": (geometry.unwrap, {"speed": np.zeros(grid.shape), "known": np.ones(grid.shape, bool), "limit": 0.4}),
         "grid_winding": (geometry.grid_winding, {"grid": grid, "vertices": body.vertices, "faces": body.faces}),
         "SurfaceIndex": (geometry.SurfaceIndex, {"surface": body, "resolution": 1e-3}),
         "SurfaceIndex.query": (geometry.SurfaceIndex(body).query, {"points": points.numpy()}),

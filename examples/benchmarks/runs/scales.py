@@ -25,6 +25,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[3]))
 
 import geometry
 import torchsph as ts
+from examples.provenance import SPLINES, write_table
+
+SOURCES = ("examples/benchmarks/runs/scales.py", *SPLINES)
 
 TIME = np.array([0.0, 0.01, 0.02])
 # radius, length and grid spacing of a tube, m; peak speed, m/s
@@ -108,7 +111,7 @@ def main() -> None:
             flush=True,
         )
     if options.json:
-        options.json.write_text(json.dumps(rows, indent=1) + "\n")
+        write_table(options.json, rows, SOURCES)
 
 
 if __name__ == "__main__":

@@ -13,12 +13,16 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import sys
 from collections.abc import Callable
 from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[3]))
 
 import numpy as np
 import torch
 
+from examples.provenance import TRACKING, write_table
 from geometry import Grid
 from torchsph.ultrasound import (
     EchoModel,
@@ -33,6 +37,8 @@ from torchsph.ultrasound import (
     simulate_packet,
 )
 from torchsph.ultrasound.measurements.training import training_points
+
+SOURCES = ("examples/benchmarks/ultrasound/tracking.py", *TRACKING)
 
 STEP = 1e-3 / 6
 CENTRE = (0.0, 0.0, 24e-3)
@@ -226,7 +232,7 @@ def main() -> None:
         print(f"-- {name}", flush=True)
         results[name] = PARTS[name](arguments.quick)
         if arguments.json:
-            arguments.json.write_text(json.dumps(results, indent=1))
+            write_table(arguments.json, results, SOURCES)
     if arguments.out:
         from tracking_figures import draw_errors, draw_response
 

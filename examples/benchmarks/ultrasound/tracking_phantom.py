@@ -14,9 +14,12 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[3]))
 
 import matplotlib
 
@@ -28,9 +31,12 @@ from scipy.ndimage import binary_erosion
 from tracking import terciles
 
 import geometry
+from examples.provenance import ANALYSES, write_table
 from torchsph.evaluation import metrics, slices
 from torchsph.methods import by_name as pipeline
 from torchsph.ultrasound import SpeckleOptions, measure_speckle
+
+SOURCES = ("examples/benchmarks/ultrasound/tracking_phantom.py", "torchsph/ultrasound", *ANALYSES)
 
 COLUMNS = 9
 
@@ -147,7 +153,7 @@ def main() -> None:
         results["loop"] = loop(measured, true, arguments.seed, arguments.members)
         print(json.dumps(results["loop"], indent=1))
     if arguments.json:
-        arguments.json.write_text(json.dumps(results, indent=1))
+        write_table(arguments.json, results, SOURCES)
 
 
 if __name__ == "__main__":

@@ -14,10 +14,17 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[3]))
 
 import numpy as np
 import pymust
+
+from examples.provenance import write_table
+
+SOURCES = ("examples/benchmarks/ultrasound/tracking_pymust.py",)
 
 STEP = (0.1e-3, 0.04e-3)  # x, z, m
 SHAPE = (121, 61)
@@ -104,7 +111,7 @@ def main() -> None:
             **statistics,
         )
     if arguments.json:
-        arguments.json.write_text(json.dumps(statistics, indent=1))
+        write_table(arguments.json, statistics, SOURCES)
 
 
 if __name__ == "__main__":

@@ -14,10 +14,12 @@ since the machine may be shared; set OMP_NUM_THREADS=1, or the threads add up.
 from __future__ import annotations
 
 import argparse
-import json
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[3]))
 
 import numpy as np
 import torch
@@ -26,10 +28,13 @@ from scipy.ndimage import uniform_filter
 from scipy.signal import correlate as scipy_correlate
 from tracking import CENTRE, STEP, image_grid, lattice
 
+from examples.provenance import TRACKING, write_table
 from geometry import Grid
 from torchsph.ultrasound import EchoModel, LinearFlow, Packet, SpeckleTracker, simulate_packet
 from torchsph.ultrasound.estimation.backends import choose_backend
 from torchsph.ultrasound.estimation.correlation import KernelShape
+
+SOURCES = ("examples/benchmarks/ultrasound/tracking_speed.py", *TRACKING)
 
 PHANTOM = (20e-3, 20e-3, 33e-3)  # x, y, z, m
 
@@ -189,7 +194,7 @@ def main() -> None:
         if ratio is not None:
             print(f"{rival}: {ratio:.1f}x, asked for {least:g}x: {'met' if ratio >= least else 'NOT met'}")
     if arguments.json:
-        arguments.json.write_text(json.dumps(results, indent=1))
+        write_table(arguments.json, results, SOURCES)
 
 
 if __name__ == "__main__":

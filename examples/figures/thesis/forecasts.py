@@ -111,7 +111,7 @@ def _draw(numbers: dict) -> Figure:
         for column, case in enumerate(CASES):
             panel = panels[row, column]
             for name, found in numbers["over_time"][f"{preset}, {case}"].items():
-                panel.plot(1e3 * np.array(found["time"]), found["rms_error"], label=name)
+                panel.plot(1e3 * np.array(found["time"]), found["rms_error"], marker=".", label=name)
             panel.set(title=f"{preset}, {case}", ylabel="RMS error, m/s", xlabel="ms", ylim=(0, None))
             panel.legend(fontsize=7)
         last = panels[row, 2]

@@ -52,7 +52,7 @@ def make(material: Material) -> Result:
             panel.plot(1e3 * truth.time, row, style, color=COLOUR[name], label=f"{name}: {found[name]:.3f}")
         panel.fill_between(1e3 * truth.time, numbers["rms_speed"], color="0.92", label="RMS speed of the truth")
         panel.set(xlabel="ms", ylabel="RMS error, m/s", ylim=(0, None))
-        panel.legend(fontsize=8, title="NRMSE over the beat")
+        panel.legend(fontsize=8, title="NRMSE over all frames", loc="center left", bbox_to_anchor=(1.0, 0.5))
         return figure
 
     return Result(numbers, claims, material.settings(), draw)

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 from matplotlib.figure import Figure
 
-import geometry
 from torchsph.evaluation.metrics import filled_velocity
 from torchsph.ultrasound import SpeckleOptions, measure_speckle
 
-from ..material import Material
+from ..material import Material, coarser
 from ..record import Claim, Result
 from ..style import planes, sequence
 
@@ -22,7 +19,7 @@ def make(material: Material) -> Result:
     frames = [truth.frames // 2] if material.fast else material.frames_every(0.075, 6)
     part = truth.select(np.array(frames))
     if material.fast:
-        part = _coarser(part)
+        part = coarser(part, 3)
     options = SpeckleOptions(every=1, training=4 if material.fast else 24)
     found = measure_speckle(part, options, material.seed)
     mask, true = np.asarray(part.mask, bool), np.asarray(part.velocity)
@@ -65,20 +62,3 @@ def make(material: Material) -> Result:
         return sequence(part, rows, range(part.frames), top)
 
     return Result(numbers, claims, material.settings(options=repr(options)), draw)
-
-
-def _coarser(recording: geometry.Recording) -> geometry.Recording:
-    """Every third node of a recording."""
-    few = (..., *(slice(None, None, 3),) * 3)
-    grid = recording.grid
-    shape = tuple(-(-n // 3) for n in grid.shape)
-    coarse = geometry.Grid(grid.origin, tuple(3 * h for h in grid.spacing), shape)
-    return replace(
-        recording,
-        grid=coarse,
-        velocity=recording.velocity[few],
-        mask=np.asarray(recording.mask)[few],
-        pressure=None,
-        weight=None,
-        sigma=None,
-    )

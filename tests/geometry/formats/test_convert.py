@@ -231,9 +231,10 @@ def test_matlab_of_both_kinds(tmp_path: Path) -> None:
     with h5py.File(tmp_path / "seven.mat", "w", userblock_size=512) as file:
         for name, field in fields.items():
             file[name] = field.T  # MATLAB stores its arrays in HDF5 with the axes reversed
-    said = FieldMap(velocity=("u", "v", "w"), spacing=tuple(STEP), length_unit="mm", interval=0.02)
+    said = FieldMap(velocity=("u", "v", "w"), spacing=tuple(STEP), length_unit="mm", interval=0.02, nyquist=1.5)
     for name in ("five.mat", "seven.mat"):
         recording = convert([tmp_path / name], said).recording
+        assert recording.nyquist.tolist() == [1.5, 1.5]
         np.testing.assert_allclose(recording.velocity[1, :, 3, 2, 4], 2 * values[4, 2, 3], rtol=1e-5)
         assert recording.time.tolist() == [0, 0.02] and recording.grid.shape == (7, 8, 9)
 

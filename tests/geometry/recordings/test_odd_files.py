@@ -196,6 +196,7 @@ print(refused)
         capture_output=True,
         text=True,
         timeout=300,
+        cwd=path.parent,
         preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_AS, (8 << 30, 8 << 30)),
     )
     assert done.returncode == 0, done.stderr

@@ -79,6 +79,7 @@ def test_an_instruction_set_that_does_not_exist_is_refused(monkeypatch):
         native.library.cache_clear()
 
 
+@pytest.mark.slow
 def test_build_makes_loadable_libraries(tmp_path, monkeypatch):
     if shutil.which("g++") is None:
         pytest.skip("no compiler here")

@@ -62,6 +62,7 @@ def test_correlated_errors_are_foreseen(width, least, most):
     assert before > least and 0.8 < now < most
 
 
+@pytest.mark.slow
 def test_shared_errors_weigh_less_in_the_fit():
     """Samples that share their errors are smoothed more, which is nearer to the truth; deviations stay right."""
     plain, counted, score = [], [], []

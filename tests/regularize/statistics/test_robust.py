@@ -8,7 +8,7 @@ from regularize.statistics.robust import inflation, robust_weight
 
 
 @pytest.mark.parametrize("kind", ["tukey", "huber"])
-@pytest.mark.parametrize("components", [2, 3])
+@pytest.mark.parametrize("components", [2, pytest.param(3, marks=pytest.mark.slow)])
 def test_inflation_equals_simulation(kind, components):
     """Spread of the location estimate of Gaussian samples against what the weighted residuals claim."""
     generator = torch.Generator().manual_seed(0)

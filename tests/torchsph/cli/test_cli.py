@@ -200,6 +200,7 @@ def test_assimilate_draws_a_picture(assimilated):
     assert image.shape[0] > 600 and image.shape[1] > 600 and image[..., :3].std() > 0.1
 
 
+@pytest.mark.slow
 def test_assimilate_alone_runs_the_default_method_without_a_truth(files, tmp_path, capsys):
     out = tmp_path / "deep" / "out"
     arguments = ["assimilate", files["measured"], *QUICK, "--members", "3", "--out", str(out)]

@@ -116,7 +116,9 @@ def no_file_beyond(limit: int) -> Iterator[None]:
         signal.signal(signal.SIGXFSZ, handler)
 
 
-@pytest.mark.parametrize("name", COMMANDS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] if name == "assimilate" else []) for name in COMMANDS]
+)
 def test_the_nth_step_fails_for_every_n(name: str, run: Callable[[str], int]) -> None:
     before = older_results(run, name)
     alone = name in (

@@ -57,6 +57,11 @@ def frames_done(status: Path, run: subprocess.Popen[str], wanted: int) -> None:
         time.sleep(0.01)
 
 
+def children(parent: int) -> list[int]:
+    """The processes that a process has started and that live."""
+    return [int(one) for one in Path(f"/proc/{parent}/task/{parent}/children").read_text().split()]
+
+
 def assert_same(one: Path, other: Path) -> None:
     """Every array of the analyses has the same bits, and nothing but results is left."""
     first, second = (geometry.read_recording(folder / "analysis.h5") for folder in (one, other))
@@ -79,12 +84,18 @@ def _whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.slow  # a minute each
-@pytest.mark.parametrize("number", [*STOP, signal.SIGKILL])
-def test_a_run_goes_on_to_the_same_bits(whole: Path, number: signal.Signals) -> None:
-    out, status = whole / number.name, whole / f"{number.name}.jsonl"
-    call = ("assimilate", "m.h5", *OPTIONS, "--out", number.name, "--status", status.name)
-    run = started(whole, *call)
+@pytest.mark.parametrize(
+    ("number", "workers"),
+    [*((number, 1) for number in STOP), (signal.SIGKILL, 1), (signal.SIGTERM, 2), (signal.SIGKILL, 2)],
+)
+def test_a_run_goes_on_to_the_same_bits(whole: Path, number: signal.Signals, workers: int) -> None:
+    name = f"{number.name}_{workers}"
+    out, status = whole / name, whole / f"{name}.jsonl"
+    call = ("assimilate", "m.h5", *OPTIONS, "--out", name, "--status", status.name)
+    run = started(whole, *call, "--workers", str(workers))
     frames_done(status, run, 2)
+    beside = children(run.pid)
+    assert len(beside) == workers - 1
     run.send_signal(number)
     killed = number == signal.SIGKILL
     said = ended(run, -number if killed else 75)
@@ -94,6 +105,10 @@ def test_a_run_goes_on_to_the_same_bits(whole: Path, number: signal.Signals) -> 
         assert f"stopped after frame {done} of {FRAMES}; run it again with --resume to go on" in said
         assert events(status)[-1]["event"] == "stopped" and events(status)[-1]["code"] == 75
         assert not (out / NAME).exists()
+    end = time.monotonic() + 30
+    while any(Path(f"/proc/{child}").exists() for child in beside):  # they end as their pipe does
+        assert time.monotonic() < end
+        time.sleep(0.05)
     before = len(events(status))
     ended(started(whole, *call, "--resume"), 0)
     again = [one["frame"] for one in events(status)[before:] if one["event"] == "frame"]

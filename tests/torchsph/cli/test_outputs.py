@@ -45,7 +45,7 @@ def test_staged_files_vanish_on_failure_and_others_stay(tmp_path):
 def test_the_scratch_folder_of_a_killed_run_is_swept_and_a_living_one_s_is_not(tmp_path):
     program = "import os, sys\nfrom torchsph.cli.outputs import staged\n"
     program += "with staged(sys.argv[1]) as scratch:\n    (scratch / 'one').touch()\n    os.kill(os.getpid(), 9)"
-    assert subprocess.run([sys.executable, "-c", program, str(tmp_path)]).returncode == -signal.SIGKILL
+    assert subprocess.run([sys.executable, "-c", program, str(tmp_path)], cwd=tmp_path).returncode == -signal.SIGKILL
     (dead,) = tmp_path.iterdir()
     (tmp_path / ".torchsph-link").symlink_to(tmp_path)
     with staged(tmp_path) as first, staged(tmp_path) as second:

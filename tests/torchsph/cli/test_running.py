@@ -236,7 +236,8 @@ with locked(sys.argv[1]):
 
 
 def test_two_runs_do_not_share_a_folder_and_the_lock_of_a_killed_one_is_taken_over(tmp_path):
-    other = subprocess.Popen([sys.executable, "-c", HOLD, str(tmp_path / "out")], stdout=subprocess.PIPE, text=True)
+    program = [sys.executable, "-c", HOLD, str(tmp_path / "out")]
+    other = subprocess.Popen(program, stdout=subprocess.PIPE, text=True, cwd=tmp_path)
     try:
         assert other.stdout.readline() == "held\n"
         with pytest.raises(ValueError, match=rf"out: another run is at work there, process {other.pid} on .* since 2"):

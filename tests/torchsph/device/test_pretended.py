@@ -144,6 +144,7 @@ class TestFields:
         many = fixed.fit_many(there[0], several.to(NAME), divergence_points=there[0])
         assert torch.allclose(many[1](there[0]).held, 2.0 * wanted(points), atol=1e-8)
 
+    @pytest.mark.slow
     def test_a_search_for_smoothness_ends_on_the_device(self, device):
         generator = torch.Generator().manual_seed(0)
         axis = (torch.arange(7, dtype=torch.float64) + 0.5) * 0.01

@@ -104,6 +104,7 @@ def test_a_restart_in_the_middle_changes_no_bit(given, plain, tmp_path):
     assert [file.name for file in tmp_path.iterdir()] == ["checkpoint.pt"]
 
 
+@pytest.mark.slow
 def test_later_frames_improve_earlier_analyses_alone(given, plain, tmp_path, monkeypatch):
     """The last analysis and all forecasts stay; earlier ones come nearer to the next data; a restart changes no bit."""
     options = EnsembleOptions(batch=2, lag=2)

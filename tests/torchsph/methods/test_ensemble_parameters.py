@@ -55,6 +55,7 @@ def measured_twin(model: Simulator, wall: geometry.Wall, true: dict[str, float])
 
 
 @pytest.mark.parametrize("strength,viscosity", [(1.5, 0.06), pytest.param(0.7, 0.15, marks=pytest.mark.slow)])
+@pytest.mark.slow
 def test_valve_strength_and_viscosity_are_found_together(strength, viscosity):
     """Within 4 and 8 % from guesses that are up to 50 and 67 % off; measured 0.1 and 2.4, 2.0 and 4.2 %."""
     model, wall = channel()
@@ -71,6 +72,7 @@ def test_valve_strength_and_viscosity_are_found_together(strength, viscosity):
         assert abs(found[name]["mean"] - true) < 2.5 * found[name]["deviation"]  # and the filter knows how well
 
 
+@pytest.mark.slow
 def test_pressure_sources_have_a_strength_and_valves_of_given_flux_have_none():
     measured = geometry.read_recording(sample_measurement())
     scene, time = Scene.from_recording(measured, 3e-3), float(measured.time[8])

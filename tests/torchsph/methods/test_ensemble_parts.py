@@ -14,7 +14,6 @@ from torchsph.data import sample_measurement
 from torchsph.evaluation.divergence import divergence_rms
 from torchsph.evaluation.metrics import spread_over_skill
 from torchsph.methods.ensemble.divergence_cleaning import without_divergence
-from torchsph.methods.ensemble.forecaster import shares
 from torchsph.methods.ensemble.lagged import LaggedAnalyses
 from torchsph.methods.measurement.error_model import ObservationError
 from torchsph.methods.measurement.frame_splines import FrameSmoother
@@ -219,20 +218,6 @@ def test_missing_values_come_with_their_reason(measured):
     assert (codes[:, seen.node == int(flat[0])] == Reason.MISSING).all()
     assert (codes[:, seen.node == int(flat[1])] == Reason.NO_WEIGHT).all()
     assert (seen.confidence[torch.isin(seen.node, torch.from_numpy(flat))] == 0).all()
-
-
-@pytest.mark.parametrize(
-    "members,cost,processes", [(16, 16.0, 1), (16, 16.0, 2), (16, 1.0, 4), (2, 16.0, 5), (7, 0.5, 3)]
-)
-def test_every_member_runs_once_and_the_loads_are_even(members, cost, processes):
-    todo = shares(members, cost, processes)
-    assert [lead for lead, _ in todo] == [True] + [False] * (processes - 1)
-    assert [k for _, part in todo for k in range(part.start, part.stop)] == list(range(members))
-    whole = shares(members, cost, processes, 3)
-    assert [k for _, part in whole for k in range(part.start, part.stop)] == list(range(members))
-    assert all(part.start % 3 == 0 or part.start == members for _, part in whole)
-    loads = [part.stop - part.start + cost * lead for lead, part in todo]
-    assert max(loads) <= max(cost, math.ceil((members + cost) / processes) + 1)
 
 
 def test_draws_have_the_deviation_that_the_posterior_states(measured):

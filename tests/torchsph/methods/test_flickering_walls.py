@@ -39,6 +39,7 @@ def test_exact_walls_are_left_alone_without_a_word():
         assert ts.PreparedMeasurement(sample).recording is sample
 
 
+@pytest.mark.slow
 def test_results_say_what_was_mended(flickering):
     few = flickering.select(slice(0, 8))
     with pytest.warns(UserWarning, match="jitters"):

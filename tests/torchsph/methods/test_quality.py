@@ -121,7 +121,7 @@ def test_codes_and_their_names_are_in_the_file(box_recording: Callable[..., geom
     with h5py.File(path) as file:
         names = file["quality"].attrs["names"]
         assert file.attrs["format_version"] == 1
-    assert list(names) == ["outside", "used", "no data", "outlier", "out of reach", "failed"]
+    assert list(names) == ["outside", "used", "no data", "outlier", "out of reach", "failed", "ambiguous"]
     assert back.select([1]).quality.shape == quality[1:2].shape and back.with_velocity(back.velocity).quality is None
     geometry.write_recording(path, plain)
     assert geometry.read_recording(path).quality is None

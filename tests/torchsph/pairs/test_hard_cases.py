@@ -192,9 +192,10 @@ print("through")
 
 @pytest.mark.parametrize("kind", ["float32", "float64"])
 @pytest.mark.skipif(not PRESENT["cpu"].present, reason=PRESENT["cpu"].reason)
-def test_small_sets_stay_inside_their_buffers(kind):
+def test_small_sets_stay_inside_their_buffers(kind, tmp_path):
     """Registers of doubles wrote up to 12 bytes behind a list's buffer, which ended the process: so in a child."""
-    done = subprocess.run([sys.executable, "-c", SMALL_SETS.format(kind=kind)], capture_output=True, text=True)
+    program = [sys.executable, "-c", SMALL_SETS.format(kind=kind)]
+    done = subprocess.run(program, capture_output=True, text=True, cwd=tmp_path)
     assert done.returncode == 0 and done.stdout.strip() == "through", done.stderr[-500:]
 
 

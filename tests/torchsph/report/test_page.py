@@ -124,6 +124,7 @@ def test_the_wall_is_cut_with_its_orifices(tmp_path, box_recording):
     assert (numbers(planes[0]["outline"]["region"]) == 1).any()  # the plane through the orifice
 
 
+@pytest.mark.slow
 def test_a_large_recording_is_thinned_and_says_so(tmp_path, box_recording):
     recording = box_recording(turning, nodes=26, times=tuple(0.001 * n for n in range(300)))
     data = data_of(written(tmp_path / "page.html", recording, recording, tracers=50))

@@ -155,6 +155,8 @@ def test_flicker_wrapping_and_the_frame_rate(box_recording):
     wrapped = replace(true, velocity=(true.velocity + limit) % (2 * limit) - limit)
     assert verdicts(wrapped, true)["Aliasing"][0] == "poor"
     assert verdicts(true, true)["Aliasing"][0] == "good"
+    told = replace(wrapped, nyquist=np.full(wrapped.frames, limit))
+    assert verdicts(told, true)["Aliasing"] == ("good", "wraps at 0.5 m/s, which is known and was taken back")
 
 
 # --- pathlines ------------------------------------------------------------------------------------

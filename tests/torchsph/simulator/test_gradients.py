@@ -94,7 +94,7 @@ def filled(ventricle, scheme, field, *, differentiable=False, dtype=torch.float6
     return (torch.where(inside, value, torch.zeros_like(value)) * draw(value.shape, 5)).sum(), run
 
 
-@pytest.mark.parametrize("name", ["default", "weakly_compressible"])
+@pytest.mark.parametrize("name", ["default", pytest.param("weakly_compressible", marks=pytest.mark.slow)])
 def test_of_a_forecast_by_20_ms_with_moving_walls_and_an_open_valve(ventricle, name):
     scheme = preset(name)
     if name == "default":

@@ -32,6 +32,7 @@ def test_the_quiet_start_fills_the_cavity_evenly():
     assert float(density.std()) < 0.03
 
 
+@pytest.mark.slow
 def test_how_quiet_a_start_is_is_measured():
     """After 10 ms of rest: nothing moves in the default scheme, 0.24 % of 1 m/s in projections, 3.3 % in the thesis's.
 

@@ -31,7 +31,7 @@ def advanced(run, start, number):
         run.project()
 
 
-@pytest.mark.parametrize("name", ["default", "weakly_compressible", "thesis"])
+@pytest.mark.parametrize("name", ["default", "weakly_compressible", pytest.param("thesis", marks=pytest.mark.slow)])
 def test_two_runs_in_turns_give_the_bits_of_each_alone(scene, name):
     """One fills while the other ejects, so that walls, open valves and buffers differ all the time."""
     starts = (0.30, 0.09)

@@ -47,6 +47,7 @@ def cavity_errors(across, reynolds, time, **changes):
     return *(float(np.sqrt(np.mean(e**2))) for e in errors), run
 
 
+@pytest.mark.slow
 def test_reynolds_100():
     """Within 1 % RMS of the lid's speed (2 % asked for) at 20^2 already: measured 0.54 and 0.20 % for u and v."""
     u, v, run = cavity_errors(20, 100, 8.0)

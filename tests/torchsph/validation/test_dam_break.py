@@ -60,6 +60,7 @@ def test_inviscid_front_runs_ahead_of_the_experiments():
     assert 0.97 < energy[-1] < 1.0  # nothing but numbers dissipates until the front meets the far wall
 
 
+@pytest.mark.slow
 def test_front_with_friction_on_the_bed():
     """Measured: 5.2 % and 2.8 %."""
     errors, _, energy, record = collapse(0.05, NUMERICAL)
@@ -67,6 +68,7 @@ def test_front_with_friction_on_the_bed():
     check_sound(record, energy, 1e-4)
 
 
+@pytest.mark.slow
 def test_front_on_the_potential_wall():
     """Measured: 16.0 % and 15.4 %, 27 % and 24 % at half the resolution.
 
@@ -80,6 +82,7 @@ def test_front_on_the_potential_wall():
     assert np.diff(energy).max() < 0.6 * np.diff(coarse_energy).max()
 
 
+@pytest.mark.slow
 def test_front_does_not_depend_on_precision_or_backend():
     """Measured at 10 particles across: 4.83 % and 2.58 % with all four, to five digits."""
     errors, _, energy, record = collapse(0.1, NUMERICAL, dtype=torch.float64, backend="reference")

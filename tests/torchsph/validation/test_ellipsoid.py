@@ -31,7 +31,9 @@ def test_the_volume_is_that_of_the_closed_form():
         assert motion.volume_rate(time) == pytest.approx(BODY.volume_rate(time), rel=2e-3, abs=1e-9)
 
 
-@pytest.mark.parametrize(("name", "bound"), [("projection", 0.065), ("weakly_compressible", 0.11)])
+@pytest.mark.parametrize(
+    ("name", "bound"), [("projection", 0.065), pytest.param("weakly_compressible", 0.11, marks=pytest.mark.slow)]
+)
 def test_ejection_follows_the_potential_flow(name, bound):
     """From rest through peak flow, 16 across, every particle of the core."""
     run, wrong, flow = BODY.start(name), 0.0, 0.0

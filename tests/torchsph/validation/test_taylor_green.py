@@ -70,6 +70,7 @@ def test_taylor_green_2d_at_100():
     assert validation.observed_order([1 / 25, 1 / 50, 1 / 100], errors) > 1.5
 
 
+@pytest.mark.slow
 def test_shifting_by_the_largest_speed_is_what_keeps_particles_even():
     """With the particle's own speed the lattice breaks up where the fluid rests; the default's strength is far less."""
     even = plane_error(25, 0.5)
@@ -100,6 +101,7 @@ def worst_energy(resolution, reynolds, scheme=None, **changes):
     return worst
 
 
+@pytest.mark.slow
 def test_taylor_green_3d_kinetic_energy():
     """Within the 3 % that the issue asks for, at Re 100 on 20^3 particles already: measured 1.6 %."""
     assert worst_energy(20, 100) < 0.025

@@ -5,8 +5,9 @@ from __future__ import annotations
 import argparse
 import json
 import shutil
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,10 +18,14 @@ from torchsph.assimilation import filter_figure
 from torchsph.evaluation import figures, metrics
 from torchsph.evaluation.scores import Scores
 from torchsph.methods import by_name
+from torchsph.methods.budget import Afforded, ensemble_spacing
 from torchsph.methods.runtime import checkpoint, parallel
+from torchsph.methods.runtime.workers import chosen_workers
 from torchsph.report import write_report
 
-from ..arguments import add_model_options, add_output_folder, add_seed, add_sidecar, names, whole
+from ..arguments import add_model_options, add_output_folder, add_seed, add_sidecar, add_workers, names, whole
+from ..budget import NAME as SPACING_FILE
+from ..budget import chosen_spacing
 from ..checks import check_spacing, informative, usable_device
 from ..command import Command
 from ..outputs import output_folder, staged, write_json, write_result
@@ -62,6 +67,7 @@ def add_method_options(parser: argparse.ArgumentParser) -> None:
         "--minimum-members", type=whole(1), metavar="N", help="end the run where fewer live through a forecast (1)"
     )
     parser.add_argument("--no-page", action="store_true", help="leave out report.html")
+    add_workers(parser)
     add_seed(parser)
     add_sidecar(parser)
     parser.add_argument(
@@ -91,6 +97,10 @@ def assimilate(args: argparse.Namespace) -> None:
         measured = informative(geometry.read_recording(measured_path), measured_path)
         also = [informative(geometry.read_recording(path), path) for path in args.also]
         truth = None if truth_path is None else geometry.read_recording(truth_path)
+        kept = folder / SPACING_FILE if "ensemble" in methods and lead else None
+        if not args.resume and kept is not None:
+            kept.unlink(missing_ok=True)
+        bought = chosen_spacing(args, partial(_afforded, measured, methods, args), kept)
         check_spacing(args.spacing, measured)
         read_out = methods_read_out(args, methods, measured)
         raw = metrics.evaluate(measured, truth, measured)  # first: a truth that does not fit must not cost a run
@@ -116,15 +126,37 @@ def assimilate(args: argparse.Namespace) -> None:
                 progress=lead and shows_bar(args),
                 quantities=read_out,
                 keep_members=folder / "members.h5" if args.keep_members else None,
+                workers=args.workers,
             )
         if not lead:
             return
+        account["processes"] = max(account["processes"], *(one.info.get("processes", 1) for one in results.values()))
+        if bought is not None:
+            account["budget"] = bought
         signals.waits = True  # what is left are seconds, and all the work is in them
         chosen = by_name.DEFAULT_METHOD if by_name.DEFAULT_METHOD in methods else methods[0]
         config = run_config(args, measured=measured_path, truth=truth_path, methods=methods, analysis=chosen)
         _write(folder, measured, truth, results, raw, config, account, args)
         if "ensemble" in methods:
             saved.unlink(missing_ok=True)  # the run is complete: there is nothing to go on with
+            (folder / SPACING_FILE).unlink(missing_ok=True)
+
+
+def _afforded(
+    measured: geometry.Recording, methods: Sequence[str], args: argparse.Namespace, budget: float
+) -> Afforded:
+    """The spacing that a budget in seconds buys."""
+    members = by_name.DEFAULT_MEMBERS if args.members is None else args.members
+    tasks = by_name.parallel_tasks(measured.frames, methods, members)
+    return ensemble_spacing(
+        measured,
+        budget,
+        members=members,
+        preset=args.preset,
+        device=args.device,
+        processes=chosen_workers(args.workers, tasks),
+        methods=methods,
+    )
 
 
 def _kept(saved: Path, resume: bool) -> bool | checkpoint.Saved:

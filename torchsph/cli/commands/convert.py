@@ -32,6 +32,7 @@ NUMBERS = {
     "interval": "s between frames",
     "period": "s of a beat; frames without times are spread over it",
     "grid-spacing": "m, of the grid for tracks or for walls alone",
+    "nyquist": "m/s, at which the velocities wrap (VENC, Doppler)",
 }
 
 
@@ -54,6 +55,7 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
     said.add_argument(
         "--image-components", action="store_true", default=None, help="components run along the image's own axes"
     )
+    said.add_argument("--cut", action="store_true", default=None, help="a plane cut out of a flow in space")
     walls = parser.add_argument_group("wall (else around the mask, open where the grid cuts it)")
     walls.add_argument("--wall", nargs="+", default=[], metavar="FILE", help="a surface, or one for each frame")
     walls.add_argument("--wall-unit", default="", metavar="UNIT", help="of its lengths (that of the fields)")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 
@@ -11,8 +12,12 @@ import geometry
 from torchsph.evaluation import figures
 from torchsph.evaluation.frames import SAME_TIME
 from torchsph.methods import by_name
+from torchsph.methods.budget import Afforded, forecast_spacing
+from torchsph.methods.forecast_skill import starts
+from torchsph.methods.runtime.workers import chosen_workers
 
-from ..arguments import add_model_options, add_output_folder, add_seed, seconds, whole
+from ..arguments import add_model_options, add_output_folder, add_seed, add_workers, seconds, whole
+from ..budget import chosen_spacing
 from ..checks import check_spacing, full_vectors, usable_device
 from ..command import Command
 from ..outputs import output_folder, staged, write_json, write_result
@@ -38,6 +43,7 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
         "--every", type=whole(1), default=1, metavar="K", help="start from each K-th frame (%(default)s)"
     )
     add_model_options(parser)
+    add_workers(parser)
     add_seed(parser)
     parser.add_argument("--save", action="store_true", help="also write the forecasts, one recording for each lead")
     add_output_folder(parser)
@@ -47,8 +53,10 @@ def forecast(args: argparse.Namespace) -> None:
     """`torchsph forecast`: skill of the simulator against lead time, beside persistence."""
     folder, device = output_folder(args.out), usable_device(args.device)
     recording = full_vectors(geometry.read_recording(args.recording), args.recording)
-    check_spacing(args.spacing, recording)
     leads = _leads_within(args.leads, recording, args.every)
+    account = provenance(args, {"recording": args.recording})
+    bought = chosen_spacing(args, partial(_afforded, recording, leads, args))
+    check_spacing(args.spacing, recording)
     skill = by_name.forecast_skill(
         recording,
         leads,
@@ -59,9 +67,12 @@ def forecast(args: argparse.Namespace) -> None:
         save=args.save,
         progress=shows_bar(args),
         seed=args.seed,
+        workers=args.workers,
     )
     config = run_config(args, recording=args.recording, leads=leads) | dict(skill.config)
-    account = provenance(args, {"recording": args.recording})
+    if bought is not None:
+        account["budget"] = bought
+    account["processes"] = max(account["processes"], config.pop("processes", 1))
     config["info"] = {"provenance": account}
     with locked(folder), staged(folder) as scratch:
         for lead, saved in skill.recordings.items():
@@ -80,6 +91,21 @@ def forecast(args: argparse.Namespace) -> None:
     if skill.failures:
         say(f"{len(skill.failures)} of the starts failed; the errors above are of the others")
     say(f"wrote forecast.png, metrics.json{' and the forecasts' if args.save else ''} to {folder}/")
+
+
+def _afforded(
+    recording: geometry.Recording, leads: Sequence[float], args: argparse.Namespace, budget: float
+) -> Afforded:
+    """The spacing that a budget in seconds buys."""
+    return forecast_spacing(
+        recording,
+        leads,
+        budget,
+        every=args.every,
+        preset=args.preset,
+        device=args.device,
+        processes=chosen_workers(args.workers, len(starts(recording, leads, args.every))),
+    )
 
 
 def _leads_within(leads: Sequence[float] | None, recording: geometry.Recording, every: int) -> tuple[float, ...]:

@@ -120,6 +120,7 @@ def summary_table(recording: geometry.Recording) -> list[list[str]]:
         "uncovered",
         "quality",
         "beam",
+        "nyquist",
         "pressure",
         "pressure_sigma",
         "volume",
@@ -132,7 +133,7 @@ def summary_table(recording: geometry.Recording) -> list[list[str]]:
     rows = [
         ["recording", "valid"],
         ["description", recording.description or "-"],
-        ["dimension", str(recording.dimension)],
+        ["dimension", "2, cut out of a flow in space" if recording.cut else str(recording.dimension)],
         ["frames", f"{len(time)}, {time[0]:g} to {time[-1]:g} s"],
         ["grid", f"{' x '.join(str(n) for n in reversed(grid.shape))} nodes, spacing {_mm(grid.spacing)} mm"],
         ["fluid", f"{recording.rho:g} kg/m3, {1e3 * recording.mu:g} mPa s"],

@@ -50,6 +50,12 @@ _OPTIONS: dict[str, dict[str, dict[str, Any]]] = {
     "noise": {
         "lateral": {"type": number(0), "metavar": "S", "help": "noise across the beam, m/s"},
         "axial": {"type": number(0), "metavar": "S", "help": "noise along the beam, m/s"},
+        "beam-only": {
+            "action": "store_true",
+            "default": None,
+            "help": "the component along the beam alone, as Doppler",
+        },
+        "nyquist": {"type": number(0, open_below=True), "metavar": "S", "help": "speed at which components wrap, m/s"},
         "outliers": {"type": number(0, 1), "metavar": "P", "help": "share of nodes that hop to a false peak"},
     },
     "speckle, doppler": {
@@ -89,9 +95,9 @@ def measure(args: argparse.Namespace) -> None:
     kind, make = _MODES[args.mode]()
     path = output_file(args.out)
     known = {option.name for option in fields(kind)}
-    asked = ("every", *(name for options in _OPTIONS.values() for name in options))
+    asked = ("every", *(name.replace("-", "_") for options in _OPTIONS.values() for name in options))
     given = {name: value for name in asked if (value := getattr(args, name)) is not None}
-    foreign = [f"--{name}" for name in given if name not in known]
+    foreign = [f"--{name.replace('_', '-')}" for name in given if name not in known]
     if foreign:
         raise ValueError(f"{', '.join(foreign)}: means nothing with --mode {args.mode}")
     true = geometry.read_recording(args.true)

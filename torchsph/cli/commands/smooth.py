@@ -7,10 +7,12 @@ import argparse
 import geometry
 from torchsph.evaluation import figures, metrics
 from torchsph.methods.by_name import predicted_memory
+from torchsph.methods.measurement.frame_splines import smooth_frames
 from torchsph.methods.measurement.prepared import PreparedMeasurement
 from torchsph.methods.memory import free_memory
+from torchsph.methods.runtime.workers import chosen_workers
 
-from ..arguments import add_sidecar
+from ..arguments import add_sidecar, add_workers
 from ..checks import full_vectors, informative, output_file
 from ..command import Command
 from ..outputs import write_analysis
@@ -22,6 +24,7 @@ from ..running.provenance import provenance
 def _arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("measurement", metavar="MEASUREMENT.h5")
     parser.add_argument("--out", required=True, metavar="SMOOTH.h5", help="the smoothed recording")
+    add_workers(parser)
     add_sidecar(parser)
 
 
@@ -31,9 +34,13 @@ def smooth(args: argparse.Namespace) -> None:
     measured = full_vectors(geometry.read_recording(args.measurement), args.measurement)
     informative(measured, args.measurement)
     prepared = PreparedMeasurement(measured, progress=shows_bar(args))
-    predicted_memory(prepared, ("spline",)).refuse_beyond(free_memory())
-    smoothed = prepared.smoothed
-    account = provenance(args, {"measurement": args.measurement})
+    foretold, free = predicted_memory(prepared, ("spline",)), free_memory()
+    workers = chosen_workers(
+        args.workers, prepared.splines.groups, lambda count: foretold.in_processes(count).fits(free)
+    )
+    foretold.in_processes(workers).refuse_beyond(free)
+    smoothed = smooth_frames(prepared.splines, shows_bar(args), workers)
+    account = provenance(args, {"measurement": args.measurement}) | {"processes": workers}
     write_analysis(path, smoothed, account, sidecar=not args.no_sidecar)
     scores = {name: metrics.evaluate(one, None, measured) for name, one in (("raw", measured), ("spline", smoothed))}
     print_table(figures.scores_table(scores, {}))

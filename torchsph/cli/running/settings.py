@@ -15,7 +15,10 @@ from ..terminal import printable
 # of the program and not of the run, so of no use in a file
 _NOT_WRITTEN = ("run", "command", "config")
 # what changes no result: where it goes, and what is told of it
-SILENT = (*_NOT_WRITTEN, "out", "status", "verbose", "quiet", "json", "resume", "minimum_members", "no_sidecar")
+SILENT = (
+    *(*_NOT_WRITTEN, "out", "status", "verbose", "quiet", "json"),
+    *("resume", "minimum_members", "no_sidecar", "workers"),
+)
 
 
 def config_named(arguments: Sequence[str]) -> str | None:

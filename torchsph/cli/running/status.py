@@ -11,6 +11,7 @@ from pathlib import Path
 from types import TracebackType
 
 from torchsph.methods.runtime.watching import FrameDone
+from torchsph.methods.runtime.workers import memory_of_workers
 
 from ..exit_codes import ExitCode, exit_code
 from .notes import LOGGER
@@ -115,7 +116,13 @@ def _iso(ahead: float) -> str:
 
 
 def _memory() -> dict[str, int]:
-    """Bytes of this process now and at most so far."""
+    """Bytes of this process and its workers now and at most so far."""
+    workers, most = memory_of_workers()
+    own = _own_memory()
+    return {"memory": own["memory"] + workers, "peak": own["peak"] + most}
+
+
+def _own_memory() -> dict[str, int]:
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
     try:
         pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])

@@ -100,7 +100,7 @@ def assimilate(
         truth: for the scores in the record alone. It never enters an analysis.
         checkpoints: file to which every cycle writes its state.
         resume: go on from it where it is there; or the checkpoint itself, where it was read already.
-        watcher: is told of every frame, and may ask the run to stop; in one process or in all of them.
+        watcher: is told of every frame, and may ask the run to stop; one process has it, or several.
         seed: of everything random. Under ``torch.distributed`` the processes share the simulations; the result is the
             same for any number of them.
         progress: show a bar.
@@ -172,8 +172,8 @@ def _run(cycle: Cycle, path: Path | None, key: str, progress: bool, watcher: Wat
             checkpoint.save(path, key, cycle.state())
         if watcher is not None:
             watcher.frame_done(FrameDone(frame, count, cycle.alive, cycle.count))
-            if anywhere(watcher.asked_to_stop()) and frame + 1 < count:
-                raise Stopped(f"stopped after frame {frame + 1} of {count}")
+        if anywhere(watcher is not None and watcher.asked_to_stop()) and frame + 1 < count:
+            raise Stopped(f"stopped after frame {frame + 1} of {count}")
 
 
 def further(also: geometry.Recording | PreparedMeasurement, first: PreparedMeasurement) -> PreparedMeasurement:

@@ -49,7 +49,8 @@ class ForecastSpread:
             length = max(fwhm_to_deviation(self.measurement.kernel), float(np.mean(grid.spacing)))
         mask = np.array(self.measurement.recording.mask[frame], bool)
         draw = self.generator if generator is None else generator
-        return flow_perturbations(self.members, mask, grid.spacing, amplitude, length, draw).to(torch.float32)
+        cut = self.measurement.recording.cut
+        return flow_perturbations(self.members, mask, grid.spacing, amplitude, length, draw, cut=cut).to(torch.float32)
 
     def prepared(self, forecasts: Forecasts, noise: Tensor | None, frame: int, factor: float) -> list[Ensemble]:
         """The forecasts as they meet the observations of ``frame``.

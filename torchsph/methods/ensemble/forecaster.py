@@ -2,7 +2,7 @@
 
 The control carries the estimate; members are needed for their differences alone, which are smoother and may be
 simulated with coarser particles (F. Rainwater and B. Hunt, Mon. Wea. Rev. 141 (2013) 3007). Processes under
-``torch.distributed`` share the runs and gather the grids.
+``torch.distributed`` share the runs.
 """
 
 from __future__ import annotations
@@ -13,15 +13,15 @@ from functools import partial
 from typing import NamedTuple
 
 import torch
-import torch.distributed as dist
 from torch import Tensor
 
 import geometry
-from torchsph.assimilation import gather_members
 from torchsph.simulator.failures import NumericalFailure
 from torchsph.simulator.grid_forecast import GridForecast, Transfer
 from torchsph.simulator.simulator import Simulator
 from torchsph.simulator.transfer.pressure_fetching import PressureAverages
+
+from ..runtime.parallel import shared
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Forecasts:
         covered: (*shape) bool at the last time, of the control.
         failed: (N,) bool.
         control_failed: the members' mean then stands for the control.
-        steps: of all runs of this process together.
+        steps: of all runs together.
         shock: what the projection had to take from the control's start, relative (``GridForecast.shock``).
         rates: mean du/dt over the interval, m/s^2, NaN where unknown, where they were asked for.
         pressure: (2, *shape), Pa, of the control, averaged over the first and the last half of the interval, up to a
@@ -69,30 +69,23 @@ class Forecasts:
     pressure: Tensor | None = None
 
 
-class Control(NamedTuple):
-    """The control's run: (times, D, *shape), NaN where it failed; (*shape) what it covers at the end; its shock.
+class Runs(NamedTuple):
+    """What one process hands to the others: the control's run, or those of members that are simulated together.
 
-    With motion its rate is the last of the fields, and ``pressure`` (2, *shape) is there.
+    Attributes:
+        fields: (times, D, *shape) of the control, (times, k, D, *shape) of members, NaN where one failed; with motion
+            their rates are the last.
+        covered: (*shape), what the control covers at the end.
+        shock: of the control.
+        pressure: (2, *shape), of the control, with motion.
+        steps: that were taken.
     """
 
     fields: Tensor
-    covered: Tensor
-    shock: float
+    covered: Tensor = torch.empty(0)
+    shock: float = 0.0
     pressure: Tensor | None = None
-
-
-def shares(members: int, control_cost: float, processes: int, batch: int = 1) -> list[tuple[bool, slice]]:
-    """Who runs what: for each process whether it runs the control, and its slice of the members.
-
-    The control, which costs as much as ``control_cost`` members, belongs to the first process; the members follow in
-    order and in whole batches, so that all processes have about the same to do.
-    """
-    batches, cost = -(-members // batch), control_cost / batch
-    fair = (batches + cost) / processes
-    ends = [min(batches, max(0, round((rank + 1) * fair - cost))) for rank in range(processes)]
-    ends[-1] = batches
-    bounds = [min(members, batch * end) for end in [0, *ends]]
-    return [(rank == 0, slice(bounds[rank], bounds[rank + 1])) for rank in range(processes)]
+    steps: int = 0
 
 
 class Forecaster:
@@ -124,8 +117,6 @@ class Forecaster:
             raise ValueError(f"a batch needs at least one member, got {batch}")
         self.batch, self.motion = batch, motion
         self.model, self.coarse, self.grid, self.transfer, self.seed = model, coarse, grid, transfer, seed
-        ratio = coarse.scene.spacing / model.scene.spacing
-        self.control_cost = ratio ** (grid.dimension + 1)  # so many more particles, and so much shorter steps
 
     def advance(
         self, ensemble: Ensemble, start: float, mask: Tensor, times: Sequence[float], masks: Sequence[Tensor]
@@ -134,17 +125,17 @@ class Forecaster:
 
         A failed member holds NaN. Every process gets the whole.
         """
-        count = len(ensemble.members)
-        rank, processes = (dist.get_rank(), dist.get_world_size()) if dist.is_initialized() else (0, 1)
-        todo = shares(count, self.control_cost, processes, self.batch)
-        lead, mine = todo[rank]
-        here = (start, mask, times, masks)
-        run = self._members(ensemble, mine, *here)
-        own, steps = None, run[1]
-        if lead:
-            own, more = self._control(ensemble, *here)
-            steps += more
-        fields, (control, covered, shock, pressure) = self._gathered(ensemble, run[0], own, todo)
+        count, here = len(ensemble.members), (start, mask, times, masks)
+        batches = [slice(first, min(first + self.batch, count)) for first in range(0, count, self.batch)]
+        # the control is the longest of the runs: the first process has it. Batches of one model share walls and seeding
+        (control, covered, shock, pressure, steps), *runs = shared(
+            [
+                partial(self._control, ensemble, *here),
+                *(partial(self._members, ensemble, these, *here) for these in batches),
+            ],
+            taken_over=self.coarse is self.model,
+        )
+        fields, steps = torch.cat([run.fields for run in runs], 1), steps + sum(run.steps for run in runs)
         fields, control, rates = self._parted(fields, control, len(times))
         failed = ~torch.isfinite(fields).flatten(2).all(2).all(0)
         lost = not bool(torch.isfinite(control).all())
@@ -164,29 +155,23 @@ class Forecaster:
     def _members(
         self,
         ensemble: Ensemble,
-        mine: slice,
+        these: slice,
         start: float,
         mask: Tensor,
         times: Sequence[float],
         masks: Sequence[Tensor],
-    ) -> tuple[Tensor, int]:
-        """(times, k, D, *shape) of this process's members, NaN where one failed; and the steps taken."""
-        done = [ensemble.members.new_zeros((len(times) + self.motion, 0, *ensemble.control.shape))]
-        total = 0
-        for first in range(mine.start, mine.stop, self.batch):
-            these = slice(first, min(first + self.batch, mine.stop))
-            parameters = {name: row[these] for name, row in ensemble.parameters.items()}
-            found, _, failed, _, steps, _ = self._run(
-                self.coarse, ensemble.members[these], parameters, start, mask, times, masks
-            )
-            done.append(torch.where(failed.reshape(1, -1, *[1] * (found.ndim - 2)), torch.nan, found))
-            total += steps
-        return torch.cat(done, 1), total
+    ) -> Runs:
+        """Members that are simulated together, NaN where one failed."""
+        parameters = {name: row[these] for name, row in ensemble.parameters.items()}
+        found, _, failed, _, steps, _ = self._run(
+            self.coarse, ensemble.members[these], parameters, start, mask, times, masks
+        )
+        return Runs(torch.where(failed.reshape(1, -1, *[1] * (found.ndim - 2)), torch.nan, found), steps=steps)
 
     def _control(
         self, ensemble: Ensemble, start: float, mask: Tensor, times: Sequence[float], masks: Sequence[Tensor]
-    ) -> tuple[Control, int]:
-        """The control's own run, and its steps."""
+    ) -> Runs:
+        """The control's own run."""
         middle = {name: row.mean()[None] for name, row in ensemble.parameters.items()}
         halves = None
         if self.motion:
@@ -196,7 +181,7 @@ class Forecaster:
             self.model, ensemble.control[None], middle, start, mask, times, masks, halves
         )
         fields = torch.where(failed[0], torch.nan, found[:, 0])
-        return Control(fields, covered[0], float(shock[0]), None if pressure is None else pressure[0]), steps
+        return Runs(fields, covered[0], float(shock[0]), None if pressure is None else pressure[0], steps)
 
     def _run(
         self,
@@ -233,33 +218,3 @@ class Forecaster:
             found = [torch.full_like(states, torch.nan)] * (len(times) + self.motion)
         steps, pressure = int(record.steps.sum()), None if averages is None else averages.fields(len(states))
         return torch.stack(found), covered.cpu(), record.failed.cpu(), going.shock, steps, pressure
-
-    def _gathered(
-        self, ensemble: Ensemble, members: Tensor, control: Control | None, todo: list[tuple[bool, slice]]
-    ) -> tuple[Tensor, Control]:
-        """All members (times, N, ...) and the control's run, the same in every process.
-
-        Args:
-            ensemble: before the forecast.
-            members: (times, k, ...) of this process.
-            control: in the process that ran it.
-            todo: who ran what (``shares``).
-        """
-        if len(todo) == 1 and control is not None:
-            return members, control
-        counts = [part.stop - part.start for _, part in todo]
-        everyone = gather_members(members.transpose(0, 1), counts).transpose(0, 1)
-        shape = (len(members), *ensemble.control.shape)
-        nodes, halves = ensemble.control[0].numel(), 2 if self.motion else 0
-        if control is None:
-            control = Control(torch.empty(shape), torch.empty(shape[2:], dtype=torch.bool), 0.0)
-        field, covered, shock, pressure = control
-        if pressure is None:
-            pressure = torch.empty((halves, *shape[2:]))
-        parts = [field.flatten(), covered.flatten(), pressure.flatten(), torch.tensor([shock], dtype=torch.float64)]
-        packed = torch.cat([part.double() for part in parts])
-        dist.broadcast(packed, 0)
-        size = field.numel()
-        field, where = packed[:size].to(field).reshape(shape), packed[size : size + nodes].reshape(shape[2:]) > 0.5
-        pressure = packed[size + nodes : -1].to(pressure).reshape(halves, *shape[2:])
-        return everyone, Control(field, where, float(packed[-1]), pressure if self.motion else None)

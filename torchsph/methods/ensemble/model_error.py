@@ -11,6 +11,9 @@ from geometry.grids.fields import convolve_axis
 
 # the potential grows from the wall over this many correlation lengths
 _WALL_LAYER = 1.5
+# RMS of a plane's divergence over that of its vorticity, in isotropic turbulence that has none in space: <(dw/dz)^2> is
+# a fifth of <(du/dy - dv/dx)^2> (Taylor 1935)
+_ACROSS = 5**-0.5
 
 
 def flow_perturbations(
@@ -20,6 +23,8 @@ def flow_perturbations(
     amplitude: float,
     length: float,
     generator: torch.Generator,
+    *,
+    cut: bool = False,
 ) -> Tensor:
     """``count`` fields (count, D, *shape) of mean zero with RMS ``amplitude`` (m/s per component) over the mask.
 
@@ -29,9 +34,10 @@ def flow_perturbations(
 
     Args:
         mask: (*shape) bool. spacing: (D,), m, x first. generator: on the CPU; the same seed gives the same fields.
+        cut: of a plane cut out of a flow in space, whose fields have a divergence too.
     """
     dimension = mask.ndim
-    potentials = 1 if dimension == 2 else 3
+    potentials = (2 if cut else 1) if dimension == 2 else 3
     step = list(reversed(spacing))  # array order
     ramp = distance_transform_edt(mask, sampling=step) / (_WALL_LAYER * length)
     ramp = torch.from_numpy(np.clip(ramp, 0.0, 1.0) ** 2)
@@ -41,6 +47,8 @@ def flow_perturbations(
     along = gradient[::-1]  # d/dx, d/dy(, d/dz)
     if dimension == 2:
         field = torch.stack([along[1][:, 0], -along[0][:, 0]], dim=1)
+        if cut:
+            field = field + _ACROSS * torch.stack([part[:, 1] for part in along], dim=1)
     else:
         a = [[along[i][:, k] for k in range(3)] for i in range(3)]  # a[i][k] = d A_k / d x_i
         field = torch.stack([a[1][2] - a[2][1], a[2][0] - a[0][2], a[0][1] - a[1][0]], dim=1)

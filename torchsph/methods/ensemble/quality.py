@@ -19,9 +19,10 @@ _CODES = {
     Reason.GROSS_ERROR: Quality.OUTLIER,
     Reason.OUT_OF_REACH: Quality.OUT_OF_REACH,
     Reason.NOT_PREDICTED: Quality.FAILED,
+    Reason.AMBIGUOUS: Quality.AMBIGUOUS,
 }
 # of several observations at a node the first of these is told
-_RANK = (Quality.USED, Quality.OUTLIER, Quality.OUT_OF_REACH, Quality.FAILED, Quality.NO_DATA)
+_RANK = (Quality.USED, Quality.AMBIGUOUS, Quality.OUTLIER, Quality.OUT_OF_REACH, Quality.FAILED, Quality.NO_DATA)
 
 
 def first_codes(measurement: Measurement, mask: Tensor) -> Tensor:

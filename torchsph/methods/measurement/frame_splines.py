@@ -14,18 +14,26 @@ from tqdm import tqdm
 
 import geometry
 import regularize
-from geometry.arguments import checked
+from geometry.arguments import between, checked
+from regularize.options import BY_DATA, CURVATURE
 from regularize.solvers.factor import Factor
 
-from ..runtime.parallel import shared
+from ..runtime.parallel import advanced, shared
+from ..runtime.workers import MOST_WORKERS, chosen_workers, spread
 from .flux_data import with_fluxes
 from .informative import refuse_exact, refuse_silent
-from .wall_rows import at_knots, faces_one_way, mean_certainty, open_regions, wall_rows
+from .unwrapping import unwrapped
+from .wall_rows import at_knots, mean_certainty, open_together, wall_rows
 from .wall_trust import wall_trust
 
 # noise and smoothness are chosen in every third frame and serve its neighbours: flow and noise change over tens of
 # milliseconds, and a choice costs four times a fit
 CHOICE_EVERY = 3
+# strength of the divergence's penalty in a plane cut out of a flow, in knot distances, sqrt(2) times smoothness's: in
+# isotropic turbulence without divergence <(du/dx + dv/dy)^2> in a plane is a third of what independent components
+# with the same <|grad v|^2> have (Taylor 1935); at the scale that smoothness cuts off
+# two thirds of it are held back so
+OF_A_CUT = 2**0.5 / CURVATURE
 
 
 def node_weights(recording: geometry.Recording, frame: int) -> np.ndarray:
@@ -58,13 +66,14 @@ class FrameSmoother:
             raise ValueError(f"choose_every must be at least 1, got {choose_every}")
         refuse_silent(recording)
         refuse_exact(recording)
-        self.estimates = geometry.estimated(recording) if estimates is None else estimates
+        self.estimates = geometry.estimated(unwrapped(recording)) if estimates is None else estimates
         recording = self.estimates.recording
         self.type = geometry.measurement_type(recording)
         if smoother.automatic and not self.type.full:
             smoother = smoother.fixed()  # there is no automatic choice from components alone
         if smoother.spacing is None:
             smoother = replace(smoother, spacing=recording.grid.spacing)
+        smoother = _for_the_plane(smoother, recording)
         self.motion: geometry.WallMotion | None = None
         self._sampler: geometry.WallSampler | None = None
         if recording.wall is not None:
@@ -217,17 +226,9 @@ class FrameSmoother:
         return fitted
 
     def _open_together(self, frame: int) -> tuple[int, ...]:
-        """Regions at a frame whose fluxes are for the data to say: several, or velocities contradict the walls.
-
-        Openings that face apart are several, also where they share a label.
-        """
-        if self.motion is None:
-            return ()
-        time = float(self.recording.time[frame])
-        regions = open_regions(self.recording, time)
-        if len(regions) == 1 and not self.estimates.contradicted:
-            return () if faces_one_way(self.motion.surface(time), regions[0]) else regions
-        return regions
+        """Regions at a frame whose fluxes are for the data to say (``open_together``)."""
+        found, motion = self.estimates.contradicted, self.motion
+        return () if motion is None else open_together(self.recording, motion, frame, found)
 
     def _trusting(self, frame: int) -> regularize.Smoother:
         """The smoother with the strength that the walls of a frame deserve: less where they are uncertain."""
@@ -310,6 +311,13 @@ def _middle(frames: FrameSmoother, group: int) -> int | None:
     return next((k for k in from_middle if frames.measures(k)), None)
 
 
+def _for_the_plane(smoother: regularize.Smoother, recording: geometry.Recording) -> regularize.Smoother:
+    """The smoother with as much divergence as a plane cut out of a flow has, where it is for us to say."""
+    if not recording.cut or smoother.divergence != BY_DATA:
+        return smoother
+    return replace(smoother, divergence=OF_A_CUT * max(smoother.knots_at(recording.grid.spacing)))
+
+
 def _motion(recording: geometry.Recording) -> geometry.WallMotion:
     """The motion of the walls; one frame alone is as fast as it says it is, though nobody knows where it goes."""
     motion, wall = geometry.WallMotion.from_recording(recording), recording.wall_for("splines")
@@ -318,9 +326,13 @@ def _motion(recording: geometry.Recording) -> geometry.WallMotion:
     return replace(motion, rates_at_keys=wall.velocity[:1].astype(np.float64))
 
 
-@checked
+@checked(workers=between(1, MOST_WORKERS))
 def smooth(
-    measured: geometry.Recording, smoother: regularize.Smoother | None = None, *, progress: bool = False
+    measured: geometry.Recording,
+    smoother: regularize.Smoother | None = None,
+    *,
+    progress: bool = False,
+    workers: int | None = 1,
 ) -> geometry.Recording:
     """Fit every frame of a measurement by a penalised B-spline (Grønli 2017, sec. 3.2).
 
@@ -330,31 +342,38 @@ def smooth(
         measured: the measurement.
         smoother: options; None takes the default preset.
         progress: show a bar on stderr (only on a terminal).
+        workers: processes that share the frames, this one among them; None: as many as it may use cores.
 
     Returns:
         A recording on the measurement's grid, mask and times.
 
     Raises:
         RecordingError: nothing was measured, or an error is stated as 0.
+        LostWorker: a worker was killed or has crashed.
     """
     frames = FrameSmoother(measured, regularize.Smoother() if smoother is None else smoother)
     frames.warn()
-    return smooth_frames(frames, progress)
+    return smooth_frames(frames, progress, chosen_workers(workers, frames.groups))
 
 
-def smooth_frames(frames: FrameSmoother, progress: bool = False) -> geometry.Recording:
+def smooth_frames(frames: FrameSmoother, progress: bool = False, workers: int = 1) -> geometry.Recording:
     """``smooth`` with a ``FrameSmoother`` of the caller's, who can then ask it what was chosen.
 
-    A frame in which nothing was measured has no spline: it holds 0 and counts as uncovered. Processes under torchrun
-    share the frames.
+    A frame in which nothing was measured has no spline: it holds 0 and counts as uncovered. Processes of a run share
+    the frames, and so do further ``workers``.
     """
+    return spread(partial(_smoothed, frames, progress), partial(_smoothed, frames), workers)
+
+
+def _smoothed(frames: FrameSmoother, progress: bool = False) -> geometry.Recording:
+    """``smooth_frames`` as each of several processes calls it."""
     recording = frames.recording
     fields = np.zeros(recording.velocity.shape, np.float32)
     missing = np.array(
         [0 if frames.measures(f) else np.count_nonzero(recording.mask[f]) for f in range(recording.frames)], np.int64
     )
     with tqdm(total=recording.frames, desc="spline", disable=None if progress else True, unit="frame") as bar:
-        groups = [partial(frames.fitted, group, bar.update) for group in range(frames.groups)]
+        groups = [partial(frames.fitted, group, partial(advanced, bar)) for group in range(frames.groups)]
         for group, (choice, fitted) in enumerate(shared(groups)):
             frames.adopt(group, choice)
             for frame, field in fitted.items():

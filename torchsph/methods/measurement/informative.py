@@ -19,7 +19,7 @@ def refuse_silent(recording: geometry.Recording, source: str = MEASUREMENT) -> N
     Raises:
         RecordingError: no node of the mask carries a finite velocity of positive weight, in any frame.
     """
-    if _measured(recording).any():
+    if carry_values(recording).any():
         return
     if not recording.mask.any():
         rule = "holds no node of blood at any frame, so there is nothing to work on; give 1 inside the blood"
@@ -44,7 +44,7 @@ def refuse_exact(recording: geometry.Recording, source: str = MEASUREMENT) -> No
     if recording.sigma is None:
         return
     fine = (np.isfinite(recording.sigma) & (recording.sigma > 0)).all(axis=1)
-    bad = _measured(recording) & ~fine
+    bad = carry_values(recording) & ~fine
     if bad.any():
         frame, *node = (int(number) for number in np.argwhere(bad)[0])
         rule = f"must be positive and finite where something was measured, but is not at {int(bad.sum())} nodes"
@@ -54,7 +54,7 @@ def refuse_exact(recording: geometry.Recording, source: str = MEASUREMENT) -> No
         )
 
 
-def _measured(recording: geometry.Recording) -> np.ndarray:
-    """(T, *shape) bool: nodes that carry a value."""
+def carry_values(recording: geometry.Recording) -> np.ndarray:
+    """(T, *shape) bool: nodes that carry a finite value of positive weight."""
     measured = recording.mask & np.isfinite(recording.velocity).all(axis=1)
     return measured if recording.weight is None else measured & (recording.weight > 0)

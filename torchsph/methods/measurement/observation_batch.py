@@ -15,6 +15,7 @@ from torchsph.assimilation import ErrorScale, Observations, concatenate
 
 from .observation_operator import FrameObservations, Measurement
 from .regions import flow_regions
+from .unwrapping import nearest_branch
 
 
 class Part(NamedTuple):
@@ -85,6 +86,8 @@ def gathered(
     )
     observations = scale.apply(concatenate([part.seen.observations for part in parts]), group)
     predicted = torch.cat([one.predict(members[time], masks[time], seen) for one, seen, time in parts], 1)
+    if any(part.seen.components.limit is not None for part in parts):
+        observations = nearest_branch(observations, predicted, torch.cat([part.seen.limit for part in parts]))
     return ObservationBatch(parts, masks, observations, group, predicted)
 
 

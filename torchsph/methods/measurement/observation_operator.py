@@ -48,6 +48,13 @@ class FrameObservations:
         """Numbers per place."""
         return self.components.parts
 
+    @property
+    def limit(self) -> Tensor:
+        """(m,) speeds, m/s, at which the numbers wrap; infinite where they do not."""
+        each = self.components.limit
+        each = torch.full((self.parts,), torch.inf, dtype=torch.float64) if each is None else each
+        return each.repeat_interleave(len(self.position))
+
 
 class Measurement:
     """One measurement of the beat, and what it would see of fields on the grid of the state.

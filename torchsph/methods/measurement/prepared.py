@@ -72,8 +72,10 @@ class PreparedMeasurement:
 
     @cached_property
     def balance(self) -> WallBalance | None:
-        """Of mass between the walls; None without walls, or where the velocities contradict them."""
+        """Of mass between the walls; None without walls, where the velocities contradict them, or in a cut plane."""
         motion = self.splines.motion
+        if self.recording.cut:  # what passes through it is not known
+            return None
         return None if motion is None or self.splines.estimates.contradicted else WallBalance(self.recording, motion)
 
     @cached_property

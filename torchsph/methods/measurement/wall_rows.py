@@ -26,6 +26,20 @@ def open_regions(recording: geometry.Recording, time: float) -> tuple[int, ...]:
     return tuple(sorted(passing & set(present)))
 
 
+def open_together(
+    recording: geometry.Recording, motion: geometry.WallMotion, frame: int, contradicted: bool
+) -> tuple[int, ...]:
+    """Regions at a frame whose fluxes are for the data to say: several, or velocities contradict the walls.
+
+    Openings that face apart are several, also where they share a label.
+    """
+    time = float(recording.time[frame])
+    regions = open_regions(recording, time)
+    if len(regions) == 1 and not contradicted:
+        return () if faces_one_way(motion.surface(time), regions[0]) else regions
+    return regions
+
+
 def faces_one_way(surface: geometry.Surface, region: int) -> bool:
     """Whether a region's faces look in about one direction, so that one plug can pass them.
 

@@ -9,7 +9,7 @@ differ by a factor on all but that flow, of mean 1 and that deviation, the same 
 from __future__ import annotations
 
 import torch
-from scipy.stats import norm
+from scipy.special import ndtri
 from torch import Tensor
 
 from ..measurement.wall_balance import WallBalance
@@ -31,7 +31,7 @@ class Amplitude:
         self.balance = balance
         # the quantiles of a normal distribution: few members then have exactly its mean, and nearly its deviation
         places = (torch.randperm(members, generator=torch.Generator().manual_seed(seed)) + 0.5) / members
-        factors = torch.from_numpy(norm.ppf(places.numpy())).float()
+        factors = torch.from_numpy(ndtri(places.numpy())).float()
         self.off = deviation * factors / factors.std()
 
     def of_fields(self, field: Tensor, frame: int) -> Tensor:

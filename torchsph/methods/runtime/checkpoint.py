@@ -12,9 +12,10 @@ from typing import Any
 
 import numpy as np
 import torch
-import torch.distributed as dist
 
 from geometry.recordings.whole_file import refuse_special, write_whole
+
+from .parallel import from_lead, rank
 
 _NAME = b"torchsph checkpoint "
 _OPENING = _NAME + b"5\n"  # then the SHA-256 of all that follows its line, the key, and torch's own file
@@ -45,7 +46,7 @@ def save(path: Path, key: str, state: dict[str, Any]) -> None:
 
     Of several processes the first alone writes.
     """
-    if dist.is_initialized() and dist.get_rank() > 0:
+    if rank() > 0:
         return
     path.parent.mkdir(parents=True, exist_ok=True)
     packed = io.BytesIO()
@@ -124,15 +125,13 @@ def shared_state(saved: Saved | None, key: str) -> dict[str, Any] | None:
     Raises:
         ValueError: it was written by another run.
     """
-    held: list[dict[str, Any] | ValueError | None] = [None]
-    if saved is not None and (not dist.is_initialized() or dist.get_rank() == 0):
+    held: dict[str, Any] | ValueError | None = None
+    if saved is not None and rank() == 0:
         try:
-            held = [saved.state(key)]
+            held = saved.state(key)
         except ValueError as fault:  # told to all processes, which would wait for this one else
-            held = [fault]
-    if dist.is_initialized():
-        dist.broadcast_object_list(held, 0)
-    found = held[0]
+            held = fault
+    found = from_lead(held)
     if isinstance(found, ValueError):
         raise found
     return found

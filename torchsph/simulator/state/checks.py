@@ -105,7 +105,7 @@ def check_arrays(particles: Particles, dimension: int, dtype: torch.dtype, devic
     """
     count = len(particles.position) if isinstance(particles.position, Tensor) and particles.position.ndim else 0
     whole = {"member": (count,), "kind": (count,), "label": (count,)}
-    shapes = {"position": (count, dimension), "velocity": (count, dimension)}
+    shapes = dict.fromkeys(("position", "velocity", "origin"), (count, dimension))
     kind = torch.device(device).type
     needed = dict.fromkeys(("position", "velocity", "deviation", "mass", "member", "kind"))
     for name, array in (needed | particles.arrays()).items():

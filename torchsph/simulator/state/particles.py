@@ -30,6 +30,9 @@ class Particles:
         label: (N,) int64, a numbering that survives sorting, or None.
         confidence: (N,), not negative, what a particle's velocity counts for in XSPH and in fetching; None: all alike.
         pressure: (N,), p / rho0 of the last projection, or None (schemes without one).
+        exchange: (N,), rate at which volume comes in through a plane that is cut out of a flow, or None.
+        origin: (N, D), where each was when somebody began to follow them (``Simulation.follow``), or None. Of a
+            particle that came later: where it came in.
     """
 
     position: Tensor
@@ -42,6 +45,8 @@ class Particles:
     label: Tensor | None = None
     confidence: Tensor | None = None
     pressure: Tensor | None = None
+    exchange: Tensor | None = None
+    origin: Tensor | None = None
 
     @property
     def count(self) -> int:
@@ -89,6 +94,10 @@ class Particles:
             theirs["confidence"] = torch.ones_like(other.mass)
         if other.pressure is None:
             theirs["pressure"] = torch.zeros_like(other.mass)
+        if other.exchange is None:
+            theirs["exchange"] = torch.zeros_like(other.mass)
+        if other.origin is None:
+            theirs["origin"] = other.position
         return self.changed(**{name: torch.cat([value, theirs[name]]) for name, value in self.arrays().items()})
 
     def repeated(self, members: int) -> Particles:
@@ -158,4 +167,6 @@ def frozen(members: Tensor, before: Particles, after: Particles) -> Particles:
     keep = {n: getattr(after, n) for n in ("position", "velocity", "deviation")}
     if before.pressure is not None:
         keep["pressure"] = after.pressure
+    if before.exchange is not None:
+        keep["mass"] = after.mass
     return after.changed(**{n: rows_frozen(members, after, getattr(before, n), value) for n, value in keep.items()})

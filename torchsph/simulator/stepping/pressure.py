@@ -287,7 +287,8 @@ def divergence_free(around: Neighbourhood, *, times: int = 1, tolerance: float =
     for _ in range(times):
         present = replace(around, particles=particles)
         divergence, _ = present.divergence(present.rates(RateTerms()))
-        change, _ = present.project(-divergence, None, None, tolerance, iterations)
+        source = -divergence if particles.exchange is None else particles.exchange - divergence
+        change, _ = present.project(source, None, None, tolerance, iterations)
         particles = particles.changed(velocity=particles.velocity + change)
     return particles.velocity
 

@@ -17,6 +17,7 @@ from ..schemes.projection import Projection
 from ..state.neighbour_list import PairSearch
 from ..state.particles import Particles
 from ..state.record import Record
+from ..transfer.exchange import grown
 from ..walls.interface import FluidAtWalls, WallSample
 from ..walls.registry import wall_forces
 from .coefficients import Coefficients
@@ -105,6 +106,8 @@ class ProjectionStepper:
             drift = drift + self._shift(self._shifting, middle.changed(velocity=velocity), gradient, step)
         acceleration = (velocity - before) * rate[:, None]
         after = middle.changed(position=middle.position + drift, velocity=velocity, pressure=pressure)
+        if after.exchange is not None:
+            after = grown(after, dt)
         return Stepped(after, acceleration, None if wall is None else _earlier(wall, half, before))
 
     @staticmethod
@@ -144,7 +147,9 @@ class ProjectionStepper:
 
     def _source(self, surroundings: Neighbourhood, sums: Rates, divergence: Tensor) -> tuple[Tensor, Tensor | None]:
         """Source of the pressure (N,), and which particles lie at a free surface (N,) bool, or None."""
-        surface, source = None, -divergence
+        surface, source, exchange = None, -divergence, surroundings.particles.exchange
+        if exchange is not None:
+            source = source + torch.where(surroundings.particles.inside, exchange, torch.zeros_like(exchange))
         if not self._terms.shepard:
             return source, surface
         filling = surroundings.filling(sums)

@@ -110,6 +110,14 @@ class ValveModel:
         """Points (n, D) where a field that is imposed tells how openings share what they pass, or None."""
         return None
 
+    def open_points(self, clock: Clock) -> Tensor | None:
+        """Points (n, D) just inside openings, where a field tells what all of them pass together, or None."""
+        return None
+
+    def through_open(self, velocity: Tensor, clock: Clock) -> Tensor:
+        """Flux inwards (members,) of a field (members, n, D) at ``open_points``."""
+        return velocity.new_zeros(len(velocity))
+
     def note_split(self, velocity: Tensor, clock: Clock) -> None:
         """Note how openings share what they pass, from a field (members, n, D) at ``split_points``."""
 

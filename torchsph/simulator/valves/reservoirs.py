@@ -22,6 +22,7 @@ from ..schemes.valve_models import Reservoir
 from ..state.clock import Clock
 from ..state.particles import CHANNEL, FLUID, RESERVOIR, Particles
 from ..state.record import Record
+from ..transfer.exchange import exchanged
 from .accounts import note_passed
 from .buffer_flow import AREA_TRUST, mean_near, scaled_profile, volume_of_rows, with_channel_flux
 from .cavity_volume import CavityVolume
@@ -72,8 +73,7 @@ class Reservoirs(ValveModel):
         """What drives the buffers of valves with a given pressure, or None."""
         if not self.openings.given:
             return None
-        unit = self._density * self.units.speed**2
-        s = self._setting
+        unit, s = self._density * self.units.speed**2, self._setting
         return PressureReservoirs(self.openings, backend, s.support_radius, unit, s.period, s.device)
 
     def _deficit(self, particles: Particles, clock: Clock) -> Tensor:
@@ -91,12 +91,19 @@ class Reservoirs(ValveModel):
         return deficit / (self.volume.volume(times) * self.relaxation)
 
     def _lead(self, number: int, clock: Clock, members: int) -> float | Tensor:
-        """See ``free_channel.free_length``."""
         return free_length(self.openings, self.volume, self._run_out, number, clock, members)
 
     def split_points(self, clock: Clock) -> Tensor | None:
         """See ``SharedFlux.points``."""
         return self._shared.points(clock)
+
+    def open_points(self, clock: Clock) -> Tensor | None:
+        """See ``SharedFlux.open_points``."""
+        return self._shared.open_points(clock)
+
+    def through_open(self, velocity: Tensor, clock: Clock) -> Tensor:
+        """See ``SharedFlux.through_open``."""
+        return self._shared.through_open(velocity, clock)
 
     def note_split(self, velocity: Tensor, clock: Clock) -> None:
         """See ``SharedFlux.read_field``."""
@@ -151,6 +158,8 @@ class Reservoirs(ValveModel):
         """The same for members that see the same planes."""
         times = clock.of_members(particles.members)
         inflow, active, given = self.volume.rate(times), self.openings.active(clock), self.openings.given
+        if particles.exchange is not None:
+            inflow = inflow - exchanged(particles)
         if self.relaxation is not None and not channel and not any(number in given for number, _ in active):
             inflow = inflow + self._deficit(particles, clock) / self.relaxation
             if self._setting.compressible:

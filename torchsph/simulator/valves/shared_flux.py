@@ -36,12 +36,16 @@ class SharedFlux:
     def read_field(self, velocity: Tensor, clock: Clock) -> None:
         """Read the split off a field (members, n, D) at ``points``."""
         free = self._free(clock)
-        counts = [len(plane.quadrature()) for _, plane in free]
-        read = [
-            -plane.area * ((part - plane.velocity) @ plane.normal).mean(1)
-            for (_, plane), part in zip(free, velocity.split(counts, dim=1), strict=True)
-        ]
-        self._keep(torch.stack(read, 1), free, clock)
+        self._keep(_through([plane for _, plane in free], velocity), free, clock)
+
+    def open_points(self, clock: Clock) -> Tensor | None:
+        """Points (n, D) just inside all openings that are open, or None."""
+        active = self._openings.active(clock)
+        return torch.cat([plane.quadrature() - MOUTH * plane.normal for _, plane in active]) if active else None
+
+    def through_open(self, velocity: Tensor, clock: Clock) -> Tensor:
+        """Flux inwards (members,) of a field (members, n, D) at ``open_points`` through all of them together."""
+        return _through([plane for _, plane in self._openings.active(clock)], velocity).sum(1)
 
     def read_buffers(self, particles: Particles, clock: Clock) -> None:
         """Read the split off the velocities of the openings' buffers, where a run goes on; nothing without them."""
@@ -66,3 +70,13 @@ class SharedFlux:
         total = torch.stack([found[n] for n in numbers]).sum(0)
         areas = total.new_tensor([plane.area for _, plane in free])
         clock.flux_split = FluxSplit.balanced(numbers, read, areas, total)
+
+
+def _through(planes: list[OpeningPlane], velocity: Tensor) -> Tensor:
+    """Flux inwards (members, openings) of a field (members, n, D) at the openings' points, one after another."""
+    counts = [len(plane.quadrature()) for plane in planes]
+    read = [
+        -plane.area * ((part - plane.velocity) @ plane.normal).mean(1)
+        for plane, part in zip(planes, velocity.split(counts, dim=1), strict=True)
+    ]
+    return torch.stack(read, 1)

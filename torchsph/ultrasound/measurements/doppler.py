@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 
 from geometry import Recording
@@ -58,8 +59,8 @@ def measure_doppler(true: Recording, options: DopplerOptions, seed: int, *, prog
         progress: whether to show a bar.
 
     Returns:
-        By colour Doppler a recording with ``beam``, its velocity (v . b) b; by vector Doppler one of full
-        vectors.
+        By colour Doppler a recording with ``beam`` and ``nyquist``, its velocity (v . b) b; by vector Doppler one of
+        full vectors.
     """
     base = options.echo_model(true.dimension)
     models = [replace(base, beams=beams) for beams in options.beams(true.dimension)]
@@ -80,7 +81,10 @@ def measure_doppler(true: Recording, options: DopplerOptions, seed: int, *, prog
         coherence = torch.stack([f.coherence for f in found]).amin(0)
         canvas.paint(frame, velocity, sigma, torch.where(accepted, coherence, 0))
     kind = "colour Doppler" if options.steering is None else f"vector Doppler, {options.steering:g} degrees"
-    return canvas.recording(
+    measured = canvas.recording(
         f"{kind} of simulated echoes, {options.summary()}, window {options.window * 1e3:g} mm, seed {seed}",
         base.beams if options.steering is None else None,
     )
+    if options.steering is not None:  # the least squares of several beams do not wrap at any one speed
+        return measured
+    return replace(measured, nyquist=np.full(measured.frames, base.acquisition.aliasing_speed))

@@ -18,6 +18,8 @@ from torch import Tensor
 from geometry import Recording
 from geometry.grids.fields import fwhm_to_deviation, masked_blur, masked_gradient, smooth_noise
 
+from .aliasing import aliased
+
 WEIGHT_FLOOR = 0.02  # a node that was measured at all keeps some weight: 0 is reserved for "nothing measured"
 
 
@@ -42,6 +44,8 @@ class NoiseModel:
             in patches as wide as ``correlation``.
         search: m/s, largest speed per component that the tracker looks for; hops are uniform within it.
         beam_axis: component measured along the beam; the last one is z in volumes, y in planes.
+        beam_only: report that component alone, as colour Doppler does: the recording has a ``beam``.
+        nyquist: m/s, speed at which each reported component wraps; ``None`` = it does not.
     """
 
     every: int = 1
@@ -55,6 +59,8 @@ class NoiseModel:
     dropout: float = 0.05
     search: float = 1.0
     beam_axis: int = -1
+    beam_only: bool = False
+    nyquist: float | None = None
 
     def __post_init__(self) -> None:
         if isinstance(self.every, bool) or not isinstance(self.every, int) or self.every < 1:
@@ -63,9 +69,9 @@ class NoiseModel:
             _require(name, getattr(self, name), 0.0, math.inf, "a deviation in m/s, >= 0")
         for name in ("outliers", "dropout"):
             _require(name, getattr(self, name), 0.0, 1.0, "a fraction in [0, 1]")
-        for name in ("correlation", "search", "blur", "shear", "clutter"):
+        for name in ("correlation", "search", "blur", "shear", "clutter", "nyquist"):
             value = getattr(self, name)
-            if value is None and name in ("blur", "shear", "clutter"):
+            if value is None and name in ("blur", "shear", "clutter", "nyquist"):
                 continue
             if value is None or not (math.isfinite(value) and value > 0):
                 raise ValueError(f"{name} must be positive and finite, got {value!r}")
@@ -221,4 +227,9 @@ def _as_measurement(
         f"measurement by a noise model, lateral {options.lateral:g}, axial {options.axial:g} m/s, "
         f"outliers {options.outliers:g}, every {options.every}, seed {seed}"
     )
-    return replace(true.select(frames).with_velocity(velocity, description=description), weight=weight)
+    measured = replace(true.select(frames).with_velocity(velocity, description=description), weight=weight)
+    if options.beam_only:
+        beam = np.zeros(true.velocity.shape[1:], np.float32)
+        beam[options.beam_axis] = 1
+        measured = replace(measured, velocity=velocity * beam, beam=beam)
+    return measured if options.nyquist is None else aliased(measured, options.nyquist)

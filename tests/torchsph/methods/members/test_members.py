@@ -139,6 +139,7 @@ def test_kept_members_give_the_same_quantities(given, followed, tmp_path):
         next(read_members(tmp_path / "none.h5", recording))
 
 
+@pytest.mark.slow
 def test_a_restart_goes_on_with_members(given, followed, tmp_path):
     recording, _, found, _ = followed
     saved, path = tmp_path / "c.pt", tmp_path / "members.h5"
@@ -224,6 +225,7 @@ def test_rounding_keeps_twelve_bits():
     assert np.isnan(rounded(np.array([np.nan], np.float32))).all()
 
 
+@pytest.mark.slow
 def test_draws_of_splines_have_their_deviation_and_repeat(given):
     splines, smoothed = given.prepared.splines, given.prepared.smoothed
     frames = list(spline_frames(splines, smoothed, 8, seed=3))

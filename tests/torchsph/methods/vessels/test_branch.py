@@ -102,6 +102,7 @@ def shares(recording: geometry.Recording) -> dict[int, float]:
     return dict(zip(labels, found.tolist(), strict=False))
 
 
+@pytest.mark.slow
 def test_the_split_is_found_in_noisy_data_and_kept_in_the_forecast(truth):
     peak = np.linalg.norm(truth.velocity, axis=1).max()
     noise = 0.1 * peak * np.random.default_rng(0).standard_normal(truth.velocity.shape)

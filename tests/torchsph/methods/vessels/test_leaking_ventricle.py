@@ -62,6 +62,7 @@ def test_the_volume_and_its_rate_are_those_of_the_closed_form_with_a_leak():
     assert flux == pytest.approx(SHARE * body.volume_rate(time), rel=0.02)
 
 
+@pytest.mark.slow
 def test_the_leak_is_found_from_noisy_data_and_kept_in_the_forecast(leaking):
     """Within a tenth of itself; the forecast's error is that of a ventricle without a leak."""
     body, tight = PulsatingEllipsoid(leak=SHARE), PulsatingEllipsoid()

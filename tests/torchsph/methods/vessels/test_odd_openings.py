@@ -71,6 +71,7 @@ def test_a_forecast_goes_through(leaking, name):
     assert going.run.record.filling.item() == pytest.approx(1.0, abs=0.08)
 
 
+@pytest.mark.slow
 def test_one_frame_alone_is_smoothed(leaking):
     """A wall that is known at one time stands still; what its openings pass is for the data to say."""
     alone = leaking.select([0])

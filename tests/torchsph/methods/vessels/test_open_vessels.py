@@ -28,7 +28,10 @@ def parabolic(noise: float, *, intervals: bool = True) -> tuple[geometry.Recordi
     return made, true
 
 
-@pytest.mark.parametrize("intervals", [True, False], ids=["times given", "times found"])
+@pytest.mark.parametrize(
+    "intervals",
+    [pytest.param(True, id="times given"), pytest.param(False, id="times found", marks=pytest.mark.slow)],
+)
 def test_flow_through_open_ends_survives_smoothing(intervals):
     """Error at most .35 of the noise everywhere, the ends included; the flux within 2 % at every section."""
     recording, true = parabolic(0.05, intervals=intervals)

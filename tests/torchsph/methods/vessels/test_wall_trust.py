@@ -32,6 +32,7 @@ def test_a_wall_that_the_flow_keeps_to_is_believed():
     assert wall_trust(*field_and_rows(0.0), 2.0) > 0.9
 
 
+@pytest.mark.slow
 def test_a_wall_that_the_flow_goes_through_counts_by_how_much():
     """Its error is the speed through it: 1 / (1 + strength^2 speed^2 / noise^2)."""
     fitted, rows = field_and_rows(0.2)

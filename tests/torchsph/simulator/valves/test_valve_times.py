@@ -100,6 +100,7 @@ def test_key_frames_near_and_far_pump_alike(step):
     assert int(run.record.outside.sum()) == 0 and not bool(run.record.failed.any())
 
 
+@pytest.mark.slow
 def test_a_wall_of_a_hundred_thousand_faces_pumps():
     body = VENTRICLE.surface(0.18e-3)
     assert len(body.faces) > 100_000

@@ -128,6 +128,7 @@ def strays(run):
     return int((~inside & (inlet.height(points).numpy() <= 0)).sum())
 
 
+@pytest.mark.slow
 def test_thesis_preset_loses_no_particle_without_saying(scene):
     run = Simulator(scene, preset("thesis")).start(0.27, seed=3)
     before = run.particles.count
@@ -166,6 +167,7 @@ def test_one_beat_of_the_phantom_in_the_thesis_preset_stays_finite():
     assert run.particles.count == before - int(run.record.removed.sum())
 
 
+@pytest.mark.slow
 def test_the_flow_through_a_valve_does_not_feel_how_often_neighbours_are_searched(recording, scene, monkeypatch):
     """Particles change sides where they cross, not when the list of neighbours happens to be made anew."""
     mask = torch.from_numpy(np.array(recording.mask[30], bool))

@@ -54,6 +54,7 @@ def test_fields_follow_a_wall_that_moves_four_spacings_between_key_frames():
         assert np.abs(seen.velocity.numpy() - velocity).max() < 0.01 * np.abs(motion.rates_at_keys).max()
 
 
+@pytest.mark.slow
 def test_no_particle_is_left_behind_by_it():
     """Over the end of the period, so that the first key frames are met again."""
     motion, spacing = swaying(np.arange(5) * 0.05, way=6e-3), 1.5e-3

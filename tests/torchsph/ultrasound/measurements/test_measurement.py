@@ -9,6 +9,7 @@ from scipy.ndimage import binary_erosion
 from ultrasound_cases import recording
 
 import geometry
+from torchsph.methods.measurement.unwrapping import unwrapped
 from torchsph.ultrasound.estimation.estimates import Estimates
 from torchsph.ultrasound.estimation.tracking import SpeckleTracker
 from torchsph.ultrasound.measurements.calibration import fit_calibration
@@ -184,6 +185,7 @@ def plane():
     )
 
 
+@pytest.mark.slow
 def test_a_plane_is_measured_along_parallel_beams_and_in_a_sector(tmp_path):
     true, options = plane(), SpeckleOptions(training=4, every=2)
     sector = dataclasses.replace(options, apex=(0.0, 0.0), depth=30e-3)
@@ -203,6 +205,19 @@ def test_a_plane_is_measured_along_parallel_beams_and_in_a_sector(tmp_path):
     seen = found.mask & (found.weight > 0) & binary_erosion(found.mask, np.ones((1, 5, 5), bool))
     along = (true.velocity[:1] * found.beam).sum(1)
     assert np.median(np.abs((found.velocity * found.beam).sum(1) - along)[seen]) < 0.03
+    np.testing.assert_allclose(found.nyquist, 0.308)
+
+
+def test_echoes_of_blood_beyond_the_limit_wrap_and_come_back():
+    true = plane()
+    slow = DopplerOptions(apex=(0.0, 0.0), depth=30e-3, every=2, prf=3e3, clutter_filter="none", tissue=0.0)
+    found = measure_doppler(true, slow, 0)
+    assert found.nyquist == pytest.approx(1540 * 3e3 / (4 * 5e6))
+    seen = found.mask & (found.weight > 0) & binary_erosion(found.mask, np.ones((1, 5, 5), bool))
+    along = (true.velocity[:1] * found.beam).sum(1)
+    before, after = (np.abs((one.velocity * found.beam).sum(1) - along)[seen] for one in (found, unwrapped(found)))
+    assert (before > found.nyquist[0]).mean() > 0.3 and (after > found.nyquist[0]).mean() < 0.01
+    assert np.median(after) < 0.03
 
 
 @pytest.mark.parametrize(
