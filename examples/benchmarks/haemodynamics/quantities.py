@@ -263,6 +263,7 @@ def main() -> None:
     given = Comparison(options.truth, options.measured, options.run)
     there = options.json is not None and options.json.exists()
     result = json.loads(options.json.read_text(encoding="utf-8")) if there else {}
+    result.pop("from", None)  # of the table that this one takes the place of
     if options.only != "components":
         result |= given.read_out()
     if options.only != "fields":
