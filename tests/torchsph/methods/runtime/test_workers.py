@@ -90,6 +90,15 @@ def test_a_worker_that_is_lost_ends_the_run_and_says_why(how, kind, words):
         spread(work, work, 2)
 
 
+@pytest.fixture
+def hears_interrupts():
+    """A process that a shell has put in the background ignores SIGINT, and pytest with it."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("hears_interrupts")
 def test_a_request_to_stop_ends_a_wait_for_workers_and_the_workers(tmp_path):
     """The lead waits in an exchange, in compiled code, for a worker that sleeps ten minutes."""
     path = tmp_path / "number"
