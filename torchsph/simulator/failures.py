@@ -17,8 +17,13 @@ class NumericalFailure(RuntimeError):
     """Every member of a run has failed; the record says how far each came."""
 
 
+# relative to that at rest: what is called weakly compressible departs from it by hundredths, and a run that has
+# exploded by any power of ten, while all its numbers are finite
+_DENSITIES = (0.0, 3.0)
+
+
 def broken_members(particles: Particles, scheme: Scheme, record: Record) -> Tensor:
-    """Members (members,) bool with a particle that is not finite, or denser or thinner than a rollback allows.
+    """Members (members,) bool with a particle that is not finite, or of a density that no liquid or rollback allows.
 
     Notes the densities on the way; in an incompressible fluid they do not change.
     """
@@ -31,9 +36,8 @@ def broken_members(particles: Particles, scheme: Scheme, record: Record) -> Tens
     if scheme.compressible:
         lowest, highest = p.per_member(p.deviation, "amin"), p.per_member(p.deviation, "amax")
         record.note_density(lowest, highest)
-        if scheme.rollback is not None:
-            least, most = scheme.rollback.density
-            broken |= (1.0 + lowest < least) | (1.0 + highest > most)
+        least, most = _DENSITIES if scheme.rollback is None else scheme.rollback.density
+        broken |= (1.0 + lowest < least) | (1.0 + highest > most)
     return broken
 
 
@@ -41,7 +45,7 @@ def broken_members(particles: Particles, scheme: Scheme, record: Record) -> Tens
 _VOLUME_TOLD, _VOLUME_SPOILT = 0.03, 0.2
 # a start that fills less of its cavity has a free surface, or is no fluid at all
 _FILLED = 0.8
-_BROKEN = "not finite, too fast for any step, or beyond the density that a rollback allows"
+_BROKEN = "not finite, too fast for any step, or beyond the densities that a liquid, or a rollback, allows"
 
 
 def check_volume(record: Record, filled: Tensor, time: float) -> None:

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from contextlib import suppress
+from itertools import zip_longest
 
 import numpy as np
 import torch
@@ -51,7 +54,7 @@ def make(material: Material) -> Result:
     for name, scheme in schemes(tank.reference_speed, 5.0 if material.fast else 10.0).items():
         model = ts.Simulator(tank, scheme)
         run = model.resume(resting_block(model, *BLOCK), 0.0)
-        shown[name] = [_after(run, time) for time in times]
+        shown[name] = _until_it_breaks(run, times)
         last = np.concatenate([points for points, _ in shown[name][-3:]])
         start = float(BLOCK[1][1] - BLOCK[0][1])
         numbers[name] = {
@@ -61,15 +64,22 @@ def make(material: Material) -> Result:
             "particles": run.particles.count,
             "steps": int(run.record.steps),
             "front_fell": start + BLOCK[0][1] - float(shown[name][-1][0][:, 1].max()),
+            "lasted_s": times[len(shown[name]) - 1],
+            "energy_over_start": _energy(*shown[name][-1]) / (GRAVITY * (BLOCK[0][1] + BLOCK[1][1]) / 2),
         }
     split = [abs(found["left_of_the_tip"] - 0.5) for found in numbers.values()]
     claims = [
         Claim(
             "the wedge splits the falling block and the flow looks natural",
-            max(split) < 0.05 and all(found["outside"] == 0 for found in numbers.values()),
+            max(split) < 0.05
+            and all(found["outside"] == 0 and found["energy_over_start"] < 1.02 for found in numbers.values())
+            and all(len(states) == len(times) for states in shown.values()),
             f"left of the tip {numbers['thesis']['left_of_the_tip']:.3f} and "
             f"{numbers['default']['left_of_the_tip']:.3f} of the particles; "
-            f"{numbers['thesis']['outside']} and {numbers['default']['outside']} outside",
+            f"{numbers['thesis']['outside']} and {numbers['default']['outside']} outside; energy at the end over that "
+            f"of the start {numbers['thesis']['energy_over_start']:.2f} and "
+            f"{numbers['default']['energy_over_start']:.2f}; good for {numbers['thesis']['lasted_s']:g} and "
+            f"{numbers['default']['lasted_s']:g} s of {times[-1]:g}",
         ),
         Claim(
             "a gap stays between the wedge and the fluid",
@@ -82,8 +92,11 @@ def make(material: Material) -> Result:
     def draw() -> Figure:
         figure, panels = axes(2, len(times), 2.4 * len(times), 2.4)
         for line, (name, states) in zip(panels, shown.items(), strict=True):
-            for axis, (points, speed), time in zip(line, states, times, strict=True):
-                axis.scatter(*points.T, c=speed, s=1.5, cmap="viridis", vmin=0, vmax=4)
+            for axis, state, time in zip_longest(line, states, times):
+                if state is not None:
+                    axis.scatter(*state[0].T, c=state[1], s=1.5, cmap="viridis", vmin=0, vmax=4)
+                else:
+                    axis.text(1.0, 1.0, "failed", ha="center")
                 axis.fill(*TANK[1:4].T, color="0.7")
                 axis.plot(*np.vstack([TANK, TANK[:1]]).T, color="0.4", linewidth=0.8)
                 axis.set(xlim=(0, 2), ylim=(0, 1.5), aspect="equal", xticks=[], yticks=[], title=f"{time:.1f} s")
@@ -93,10 +106,24 @@ def make(material: Material) -> Result:
     return Result(numbers, claims, material.settings(recording=None, spacing_m=spacing), draw)
 
 
+def _until_it_breaks(run: Simulation, times: Sequence[float]) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Positions and speeds at the times that the run lives to see."""
+    seen: list[tuple[np.ndarray, np.ndarray]] = []
+    with suppress(ts.NumericalFailure):
+        for time in times:
+            seen.append(_after(run, time))
+    return seen
+
+
 def _after(run: Simulation, time: float) -> tuple[np.ndarray, np.ndarray]:
     run.advance(time)
     speed = torch.linalg.norm(run.particles.velocity, dim=1) * run.units.speed
     return (run.particles.position * run.units.length).double().numpy(), speed.double().numpy()
+
+
+def _energy(points: np.ndarray, speed: np.ndarray) -> float:
+    """Kinetic and potential energy of particles of equal mass, J/kg."""
+    return float((speed**2 / 2 + GRAVITY * points[:, 1]).mean())
 
 
 def _gap(points: np.ndarray, spacing: float) -> float:
