@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import torch
+from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 KERNEL_REACH = 3.5  # a Gaussian is cut at this many deviations, where 0.05 % of its mass is lost per axis
@@ -41,6 +43,12 @@ def convolve_axis(field: Tensor, kernel: Tensor, axis: int, *, padded: bool) -> 
     for shift, share in enumerate(others, 1):
         total.add_(field.narrow(axis, shift, size), alpha=share)
     return total
+
+
+def continued(field: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """``field`` (*lead, *shape) with the value of the nearest node of ``known`` (*shape) bool wherever it is not."""
+    nearest = distance_transform_edt(~known, return_distances=False, return_indices=True)
+    return np.ascontiguousarray(field[(..., *nearest)])
 
 
 def masked_blur(field: Tensor, mask: Tensor, deviation: float, spacing: tuple[float, ...]) -> Tensor:

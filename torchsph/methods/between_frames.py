@@ -24,12 +24,11 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from numpy.typing import ArrayLike
-from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 import geometry
 from geometry.arguments import checked, finite
-from geometry.grids.fields import masked_blur
+from geometry.grids.fields import continued, masked_blur
 from torchsph.evaluation.frames import SAME_TIME
 from torchsph.evaluation.metrics import filled_velocity, gaps
 from torchsph.simulator.failures import NumericalFailure
@@ -283,11 +282,10 @@ class BetweenFrames:
 
 def _sampled(grid: geometry.Grid, field: np.ndarray, mask: np.ndarray, stencil: geometry.Stencil) -> np.ndarray:
     """A field (D, *shape) at points, (n, D), the nearest nodes of the blood going on beyond it."""
-    continued = _continued(torch.from_numpy(np.asarray(field, np.float64)), mask)
-    return grid.sample(continued, stencil).numpy().T
+    everywhere = _continued(torch.from_numpy(np.asarray(field, np.float64)), mask)
+    return grid.sample(everywhere, stencil).numpy().T
 
 
 def _continued(field: Tensor, mask: np.ndarray) -> Tensor:
     """A field (D, *shape) with the value of the nearest node of the mask outside it."""
-    nearest = distance_transform_edt(~mask, return_distances=False, return_indices=True)
-    return torch.from_numpy(np.ascontiguousarray(field.numpy()[(slice(None), *nearest)]))
+    return torch.from_numpy(continued(field.numpy(), mask))

@@ -23,6 +23,7 @@ from torchsph.pairs.smoothing_kernels import kernel
 from torchsph.simulator.schemes.scheme import Scheme
 
 from .measurement.frame_splines import FrameSmoother
+from .runtime.control_groups import OWN, ROOT, control_groups
 
 _BANDS = 4  # copies of a spline's band that live at once while its smoothness is chosen
 _PER_SAMPLE = 10_000  # bytes of rows and of errors that neighbours share
@@ -188,28 +189,14 @@ def _machine() -> int | None:
         return None
 
 
-def _control_group(root: Path = Path("/sys/fs/cgroup"), own: Path = Path("/proc/self/cgroup")) -> int | None:
+def _control_group(root: Path = ROOT, own: Path = OWN) -> int | None:
     """What the tightest of the groups around this process leaves (cgroup v2, or v1's memory controller)."""
-    try:
-        entries = [line.split(":", 2) for line in own.read_text(encoding="utf-8").splitlines()]
-    except OSError:
-        return None
-    left: list[int] = []
-    for _, controllers, path in entries:
-        if controllers == "":
-            base, most, used, cache = root, "memory.max", "memory.current", "inactive_file "
-        elif "memory" in controllers.split(","):
-            base, most, used = root / "memory", "memory.limit_in_bytes", "memory.usage_in_bytes"
-            cache = "total_inactive_file "
-        else:
-            continue
-        group = base / path.lstrip("/")
-        for folder in (group, *group.parents):
-            size = _left(folder, most, used, cache)
-            left += [] if size is None else [size]
-            if folder == base:
-                break
-    return min(left, default=None)
+    first = ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file ")
+    sizes = [
+        _left(folder, *(("memory.max", "memory.current", "inactive_file ") if second else first))
+        for folder, second in control_groups("memory", root, own)
+    ]
+    return min((size for size in sizes if size is not None), default=None)
 
 
 def _left(folder: Path, most: str, used: str, cache: str) -> int | None:

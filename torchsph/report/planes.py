@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import torch
 import trimesh
-from scipy.ndimage import binary_dilation, distance_transform_edt
+from scipy.ndimage import binary_dilation
 
 import geometry
-from geometry.grids.fields import masked_gradient
+from geometry.grids.fields import continued, masked_gradient
 from torchsph.evaluation.metrics import filled_velocity
 from torchsph.evaluation.slices import Plane, body_points, valve_plane
 from torchsph.haemodynamics.fields.sampling import sample_in_mask
@@ -140,8 +140,7 @@ def _cut(
     covered = (share > 1e-6).reshape(size)
     values = values.reshape(-1, *size)
     if covered.any():  # the nearest values go on beyond the blood, so that the page can interpolate up to the wall
-        nearest = distance_transform_edt(~covered, return_distances=False, return_indices=True)
-        values = values[(slice(None), *nearest)]
+        values = continued(values, covered)
     parts, first = {}, 0
     for name, field in fields.items():
         parts[name] = values[first : first + len(field)]

@@ -13,11 +13,11 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from numpy.typing import ArrayLike
-from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
 import geometry
+from geometry.grids.fields import continued
 
 __all__ = ["MovingFlow", "MovingWalls"]
 
@@ -67,7 +67,7 @@ class MovingFlow:
             raise ValueError(f"MovingFlow: in_time must be one of {TIME_CURVES}, not {in_time!r}")
         if not inside.reshape(len(inside), -1).any(1).all():
             raise ValueError("MovingFlow: a frame has no node in the blood")
-        filled = np.stack([_continued(v, m) for v, m in zip(speed, inside, strict=True)])
+        filled = np.stack([continued(v, m) for v, m in zip(speed, inside, strict=True)])
         self.frames = torch.as_tensor(filled, dtype=dtype, device=device)
         self.slopes = self._slopes(events) if in_time == "cubic" else None
 
@@ -143,12 +143,6 @@ class MovingFlow:
             near = [e for e in events if self.time[n - 1] < e < self.time[n + 1]]
             found.append((chords[n - 1], chords[n]) if near else (middle, middle))
         return found
-
-
-def _continued(velocity: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """A frame `(D, *shape)` with the value of the nearest node of the blood outside it."""
-    nearest = distance_transform_edt(~mask, return_distances=False, return_indices=True)
-    return velocity[(slice(None), *nearest)]
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,8 @@ import math
 import os
 from pathlib import Path
 
+from .control_groups import OWN, ROOT, control_groups
+
 
 def usable_cores() -> int:
     """How many, at least 1.
@@ -24,28 +26,13 @@ def _asked(threads: str) -> int | None:
     return int(first) if first.isdigit() and int(first) > 0 else None
 
 
-def _quota(root: Path = Path("/sys/fs/cgroup"), own: Path = Path("/proc/self/cgroup")) -> float | None:
+def _quota(root: Path = ROOT, own: Path = OWN) -> float | None:
     """Cores' worth of time that the tightest group around this process may take (cgroup v2, or v1's cpu controller)."""
-    try:
-        entries = [line.split(":", 2) for line in own.read_text(encoding="utf-8").splitlines()]
-    except OSError:
-        return None
-    found: list[float] = []
-    names: tuple[str, ...]
-    for _, controllers, path in entries:
-        if controllers == "":
-            base, names = root, ("cpu.max",)
-        elif "cpu" in controllers.split(","):
-            base, names = root / "cpu", ("cpu.cfs_quota_us", "cpu.cfs_period_us")
-        else:
-            continue
-        group = base / path.lstrip("/")
-        for folder in (group, *group.parents):
-            share = _share(folder, names)
-            found += [] if share is None else [share]
-            if folder == base:
-                break
-    return min(found, default=None)
+    shares = [
+        _share(folder, ("cpu.max",) if second else ("cpu.cfs_quota_us", "cpu.cfs_period_us"))
+        for folder, second in control_groups("cpu", root, own)
+    ]
+    return min((share for share in shares if share is not None), default=None)
 
 
 def _share(folder: Path, names: tuple[str, ...]) -> float | None:

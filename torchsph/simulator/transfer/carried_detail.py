@@ -20,6 +20,7 @@ from torch import Tensor
 
 import geometry
 from geometry.grids.cubic import CubicInterpolation
+from geometry.grids.fields import continued
 
 # distance from what is no blood, in grid spacings, up to which the detail moves with the wall, and from which on with
 # the fluid: the first layer of nodes, and two farther on
@@ -86,11 +87,9 @@ class CarriedDetail:
 
 def _continued(detail: Tensor, known: Tensor) -> Tensor:
     """(members, D, *shape) with the value of the nearest known node where nothing is known."""
-    known_nodes = known.cpu().numpy()
-    if known_nodes.all():
+    nodes = known.cpu().numpy()
+    if nodes.all():
         return detail
-    if not known_nodes.any():
+    if not nodes.any():
         return torch.zeros_like(detail)
-    nearest = distance_transform_edt(~known_nodes, return_distances=False, return_indices=True)
-    flat = torch.from_numpy(np.ravel_multi_index(tuple(nearest), known_nodes.shape).reshape(-1)).to(detail.device)
-    return detail.flatten(2)[:, :, flat].reshape(detail.shape)
+    return torch.from_numpy(continued(detail.cpu().numpy(), nodes)).to(detail.device)
