@@ -10,6 +10,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
+from geometry.formats.own_mark import SOURCE
 from geometry.recordings.read import read_recording
 from geometry.recordings.recording import Recording, Wall
 
@@ -41,6 +42,7 @@ def write_sidecar(recording_file: str | Path, recording: Recording | None = None
             if node is not None:
                 _virtual(points, name, node, recording, source.name)
         time_steps(file["VTKHDF"], recording.time, list(points))
+        file.attrs[SOURCE] = source.name
     if recording.wall is None:
         return [path]
     beside = path.with_name(f"{path.stem}_wall.vtkhdf")
