@@ -24,7 +24,6 @@ from .series import read_fields
 from .source import FormatError, understood
 from .walls import inside_at, wall_by_displacements, wall_from_files, wall_from_mask
 
-
 ADDED = ("nyquist", "cut", "period")  # what is added to a recording that there is
 
 

@@ -161,7 +161,7 @@ def test_what_an_export_has_lost_is_told(full: Recording, tmp_path: Path) -> Non
 
 @pytest.mark.parametrize("to", sorted(EXPORTS))
 def test_a_damaged_file_is_told_by_its_name_whatever_its_reader_raises(
-    recording: Recording, tmp_path: Path, to: str
+    recording: Recording, tmp_path: Path, to: str, capfd: pytest.CaptureFixture[str]
 ) -> None:
     if to in PACKAGES:
         pytest.importorskip(PACKAGES[to], reason=EXTRA)
@@ -178,6 +178,7 @@ def test_a_damaged_file_is_told_by_its_name_whatever_its_reader_raises(
             assert path.name in str(fault) or files[0].name in str(fault)
         else:  # what was overwritten was not read, or values of the field
             assert found.velocity.shape == recording.velocity.shape
+    assert capfd.readouterr() == ("", "")  # vtk speaks in colours
 
 
 def test_a_sidecar_holds_no_copy_of_the_fields(recording: Recording, tmp_path: Path) -> None:
