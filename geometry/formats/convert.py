@@ -9,6 +9,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
+from geometry.arguments import checked
 from geometry.grids.grid import Grid
 from geometry.recordings.read import read_recording
 from geometry.recordings.recording import Recording, Wall
@@ -73,6 +74,7 @@ class Converted:
     notes: tuple[str, ...] = ()
 
 
+@checked
 def convert(
     inputs: Sequence[str | Path],
     said: FieldMap | None = None,

@@ -10,6 +10,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
+from geometry.arguments import checked
 from geometry.formats.own_mark import SOURCE
 from geometry.recordings.read import read_recording
 from geometry.recordings.recording import Recording, Wall
@@ -18,6 +19,7 @@ from .common import SCALARS, VECTORS, wall_velocity
 from .vtkhdf import TOPOLOGIES, image_data, in_memory, time_steps
 
 
+@checked
 def write_sidecar(recording_file: str | Path, recording: Recording | None = None) -> list[Path]:
     """VTKHDF files beside a recording's file, tens of kB, that viewers open in its place.
 

@@ -10,8 +10,18 @@ import h5py
 import numpy as np
 import pytest
 
-from geometry import Grid, OpeningFlux, Recording, Wall, read_recording, write_recording
-from geometry.formats import EXPORTS, FieldMap, FormatError, PolySeries, WallOptions, convert, export, write_sidecar
+from geometry import Grid, OpeningFlux, Recording, Wall, read_recording, write_recording, write_surface
+from geometry.formats import (
+    EXPORTS,
+    FieldMap,
+    FormatError,
+    PolySeries,
+    WallOptions,
+    convert,
+    export,
+    from_xarray,
+    write_sidecar,
+)
 
 EXTRA = "the extra `formats` is not installed"
 PACKAGES = {"vti": "vtk", "nifti": "nibabel", "nrrd": "nrrd", "netcdf": "xarray"}
@@ -135,6 +145,20 @@ def test_every_export_comes_back_whole_without_an_option(full: Recording, tmp_pa
     assert convert([files[0]], FieldMap(nyquist=0.3)).recording.nyquist.tolist() == [0.3] * 3
     if to == "vti":
         assert_all_of_it(full, convert([path for path in files if path.suffix == ".vti"]).recording)
+
+
+def test_slips_of_a_caller_are_told_where_they_enter(recording: Recording, tmp_path: Path) -> None:
+    surface = recording.wall_for("the test").at(0)
+    with pytest.raises(ValueError, match="write_surface: scale must be positive"):
+        write_surface(tmp_path / "a.stl", surface, scale=0.0)
+    for call, told in (
+        (lambda: write_surface(None, surface), "write_surface: path must be text or a Path, got None"),
+        (lambda: export(recording, None, "npz"), "export: path must be text or a Path"),
+        (lambda: convert("m.h5"), "convert: inputs must be a sequence, each text or a Path, got 'm.h5'"),
+        (lambda: from_xarray(3), "from_xarray: dataset must be an xarray Dataset, got 3"),
+    ):
+        with pytest.raises(TypeError, match=told):
+            call()
 
 
 def test_what_an_export_has_lost_is_told(full: Recording, tmp_path: Path) -> None:
