@@ -77,8 +77,12 @@ class QuantityTables:
             # what is quadratic in the velocity is too small in the analysis itself: its best value is the members' mean
             made = cls(recording.time, {"analysis": members.estimate}, members.bands(), members.beat_bands())
         if truth is not None:
-            made.curves["truth"] = plain_curves(truth.select(matching_frames(recording.time, truth.time, "the truth")))
+            made.compare(truth)
         return made
+
+    def compare(self, truth: geometry.Recording) -> None:
+        """Add the truth's frames at the analysis's times."""
+        self.curves["truth"] = plain_curves(truth.select(matching_frames(self.time, truth.time, "the truth")))
 
     @property
     def beat(self) -> dict[str, Curves]:

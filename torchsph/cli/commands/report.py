@@ -9,10 +9,12 @@ from typing import Any
 
 import geometry
 from torchsph.evaluation import metrics
+from torchsph.evaluation.frames import matching_frames
 from torchsph.report import write_report
 
 from ..checks import output_file
 from ..command import Command
+from ..cures import about
 from ..printing import say
 from ..running.provenance import provenance
 
@@ -32,6 +34,10 @@ def report(args: argparse.Namespace) -> None:
     measured, truth = (
         None if name is None else geometry.read_recording(name) for name in (args.measurement, args.truth)
     )
+    for name, other in ((args.measurement, measured), (args.truth, truth)):
+        if other is not None:
+            with about(name):
+                matching_frames(analysis.time, other.time, "this recording")
     named = {"raw": measured, "analysis": analysis}
     scores = {
         name: metrics.evaluate(recording, truth, measured) for name, recording in named.items() if recording is not None
