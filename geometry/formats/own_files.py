@@ -236,7 +236,7 @@ def _listed(series: Path) -> list[Path]:
     """The frames that a ParaView series names, which lie beside it."""
     try:
         names = [str(one["name"]) for one in json.loads(series.read_text(encoding="utf-8"))["files"]]
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return []
     return [series.with_name(Path(name).name).resolve() for name in names]
 

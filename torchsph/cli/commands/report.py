@@ -17,6 +17,7 @@ from ..command import Command
 from ..cures import about
 from ..printing import say
 from ..running.provenance import provenance
+from ..running.small_files import read_small
 
 
 def _arguments(parser: argparse.ArgumentParser) -> None:
@@ -59,9 +60,10 @@ def report(args: argparse.Namespace) -> None:
 
 def _document(name: str) -> dict[str, Any]:
     """The document of quantities in a file, refused where it is none."""
+    content = read_small(name)
     try:
-        found = json.loads(Path(name).read_text(encoding="utf-8"))
-    except ValueError as fault:
+        found = json.loads(content)
+    except (ValueError, RecursionError) as fault:
         raise ValueError(f"--quantities {name}: is no JSON ({fault}); give what `torchsph quantify` wrote") from fault
     if not isinstance(found, dict) or "curves" not in found:
         raise ValueError(f"--quantities {name}: has no curves; give what `torchsph quantify` wrote")
