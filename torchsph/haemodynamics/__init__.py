@@ -25,7 +25,7 @@ from .lagrangian.moving_flow import MovingFlow, MovingWalls
 from .lagrangian.tracers import Tracers, carry, residence_time, seed_blood
 from .pressure import PressureSolver, pressure_difference, region_mean
 from .quantities import UNITS, FieldQuantities, FlowDomain, FrameQuantities, flow_quantities, long_axis
-from .uncertainty import RunningMoments, Summary, around, coverage, summary
+from .uncertainty import RunningMoments, Summary, around, coverage, summary, unresolved
 from .vortices import PlaneVortex, VortexRing, main_vortex, vortex_cores, vortex_ring
 from .vorticity import helicity_density, lambda2, q_criterion, vorticity
 from .wall_shear import WallShear
@@ -86,6 +86,7 @@ __all__ = [
     "seed_blood",
     "stroke_volume",
     "summary",
+    "unresolved",
     "time_derivative",
     "vortex_cores",
     "vortex_ring",
