@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from .methods.measurement.frame_splines import smooth
     from .methods.measurement.prepared import PreparedMeasurement as PreparedMeasurement
     from .methods.nudging import FilteredRun, filter_sph
+    from .methods.over_time import AveragedOverTime, average_over_time
     from .methods.resample import resample
     from .pairs.smoothing_kernels import KERNELS, SmoothingKernel, kernel
     from .report.write import write_report
@@ -49,6 +50,7 @@ __all__ = [
     "METHODS",
     "PRESETS",
     "XSPH",
+    "AveragedOverTime",
     "BetweenFrames",
     "CompleteKernelWall",
     "EnsembleOptions",
@@ -80,6 +82,7 @@ __all__ = [
     "WeaklyCompressible",
     "__version__",
     "assimilate",
+    "average_over_time",
     "default_filter",
     "estimate_error",
     "filter_sph",
@@ -128,6 +131,10 @@ _HOMES = {
     "methods.nudging": (
         "FilteredRun",
         "filter_sph",
+    ),
+    "methods.over_time": (
+        "AveragedOverTime",
+        "average_over_time",
     ),
     "methods.resample": ("resample",),
     "pairs.smoothing_kernels": (
