@@ -20,9 +20,9 @@ if TYPE_CHECKING:
     from .methods.forecast_skill import ForecastSkill, skill
     from .methods.measurement.error_model import ObservationError, estimate_error
     from .methods.measurement.frame_splines import smooth
+    from .methods.measurement.over_time import AveragedOverTime, average_over_time
     from .methods.measurement.prepared import PreparedMeasurement as PreparedMeasurement
     from .methods.nudging import FilteredRun, filter_sph
-    from .methods.over_time import AveragedOverTime, average_over_time
     from .methods.resample import resample
     from .pairs.smoothing_kernels import KERNELS, SmoothingKernel, kernel
     from .report.write import write_report
@@ -127,14 +127,14 @@ _HOMES = {
         "estimate_error",
     ),
     "methods.measurement.frame_splines": ("smooth",),
+    "methods.measurement.over_time": (
+        "AveragedOverTime",
+        "average_over_time",
+    ),
     "methods.measurement.prepared": ("PreparedMeasurement",),
     "methods.nudging": (
         "FilteredRun",
         "filter_sph",
-    ),
-    "methods.over_time": (
-        "AveragedOverTime",
-        "average_over_time",
     ),
     "methods.resample": ("resample",),
     "pairs.smoothing_kernels": (

@@ -8,9 +8,9 @@ import geometry
 from torchsph.evaluation import figures, metrics
 from torchsph.methods.by_name import predicted_memory
 from torchsph.methods.measurement.frame_splines import smooth_frames
+from torchsph.methods.measurement.over_time import average_over_time
 from torchsph.methods.measurement.prepared import PreparedMeasurement
 from torchsph.methods.memory import free_memory
-from torchsph.methods.over_time import average_over_time
 from torchsph.methods.runtime.workers import chosen_workers
 
 from ..arguments import AUTO, add_sidecar, add_workers, number

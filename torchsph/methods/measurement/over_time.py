@@ -17,8 +17,8 @@ from scipy.sparse import csr_array
 import geometry
 from geometry.arguments import checked
 
-from .measurement.frame_splines import FrameSmoother
-from .measurement.wall_balance import WallBalance
+from .frame_splines import FrameSmoother
+from .wall_balance import WallBalance
 
 __all__ = ["AveragedOverTime", "average_over_time"]
 
