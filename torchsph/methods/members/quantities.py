@@ -12,9 +12,9 @@ import torch
 from numpy.typing import NDArray
 
 import geometry
-from torchsph.haemodynamics.beat import beat_numbers
+from torchsph.haemodynamics.domain import PROBE, DomainFrame, FlowDomain
 from torchsph.haemodynamics.pressure import region_mean
-from torchsph.haemodynamics.quantities import PROBE, UNITS, FlowDomain, FrameQuantities
+from torchsph.haemodynamics.quantities import Catalogue, catalogue
 from torchsph.haemodynamics.uncertainty import Summary, summary
 
 from .frames import MemberFrame
@@ -33,18 +33,20 @@ class MemberCurves:
 
     Attributes:
         time: `(T,)`, s.
-        estimate: of the analysis, by the names of `quantities.UNITS`, `(T,)`.
+        kind: which quantities they are.
+        estimate: of the analysis, by their names, `(T,)`.
         members: of every member, `(N, T)`.
         pressure: `(T, *shape)`, Pa, the simulator's own where there is one, else that of the velocities; its mean at
-            the inlet is 0.
-        pressure_sigma: `(T, *shape)`, Pa, standard deviation over the members.
+            the inlet is 0. None in a plane that blood passes through, whose velocities do not give it.
+        pressure_sigma: `(T, *shape)`, Pa, standard deviation over the members; None like it.
     """
 
     time: Array
+    kind: Catalogue
     estimate: dict[str, Array]
     members: dict[str, Array]
-    pressure: NDArray[np.float32]
-    pressure_sigma: NDArray[np.float32]
+    pressure: NDArray[np.float32] | None
+    pressure_sigma: NDArray[np.float32] | None
 
     def bands(self) -> dict[str, Summary]:
         """Mean, deviation and band of every curve."""
@@ -52,11 +54,11 @@ class MemberCurves:
 
     def beat(self) -> dict[str, Array]:
         """Numbers of the beat of the analysis."""
-        return beat_numbers(self.time, self.estimate)
+        return self.kind.beat(self.time, self.estimate)
 
     def beat_bands(self) -> dict[str, Summary]:
         """Mean, deviation and band of the numbers of the beat."""
-        return {name: summary(values) for name, values in beat_numbers(self.time, self.members).items()}
+        return {name: summary(values) for name, values in self.kind.beat(self.time, self.members).items()}
 
 
 class MemberQuantities:
@@ -69,9 +71,6 @@ class MemberQuantities:
 
     Attributes:
         fault: what went wrong, or None.
-
-    Raises:
-        ValueError: it is a plane recording.
     """
 
     fault: str | None
@@ -79,6 +78,7 @@ class MemberQuantities:
     def __init__(self, recording: geometry.Recording, *, strict: bool = True) -> None:
         self.strict, self.fault = strict, None
         self.domain = FlowDomain.from_recording(recording)
+        self.kind = catalogue(recording.dimension, recording.cut)
         self._sampler = geometry.WallSampler(self.domain.motion, min(self.domain.grid.spacing))
         self._curves: list[Array] = []
         self._pressure: list[NDArray[np.float32]] = []
@@ -102,7 +102,7 @@ class MemberQuantities:
             del kept[frame.frame :]
         if len(self._curves) != frame.frame:
             raise ValueError(f"frame {frame.frame} comes after {len(self._curves)} frames: they must come in order")
-        of_frame = FrameQuantities(self.domain, frame.frame, self._sampler)
+        of_frame = self.kind.frame(self.domain, frame.frame, self._sampler)
         velocity = np.concatenate([frame.field[None], frame.members])
         rate = np.concatenate([frame.rate[None], frame.member_rates])
         group = max(1, int(_NODES_AT_ONCE / self.domain.grid.size))
@@ -110,8 +110,13 @@ class MemberQuantities:
             of_frame.of(np.nan_to_num(velocity[k : k + group], posinf=0.0, neginf=0.0), rate[k : k + group])
             for k in range(0, len(velocity), group)
         ]
-        self._curves.append(np.concatenate([np.stack([p.curves[name] for name in UNITS], axis=-1) for p in parts]))
-        pressures = np.concatenate([p.pressure.astype(np.float32) for p in parts])
+        self._curves.append(
+            np.concatenate([np.stack([p.curves[name] for name in self.kind.units], axis=-1) for p in parts])
+        )
+        fields = [p.pressure for p in parts if p.pressure is not None]
+        if not fields:
+            return
+        pressures = np.concatenate([field.astype(np.float32) for field in fields])
         pressures = np.stack([self._gauged(one, of_frame) for one in pressures])
         own = pressures[0]
         if frame.pressure is not None:
@@ -125,9 +130,10 @@ class MemberQuantities:
         if len(self._curves) != len(self.domain.time):
             raise ValueError(f"{len(self._curves)} of {len(self.domain.time)} frames have come: the run did not end")
         curves = np.stack(self._curves)  # (T, 1 + N, quantities)
-        estimate = {name: curves[:, 0, k] for k, name in enumerate(UNITS)}
-        members = {name: curves[:, 1:, k].T for k, name in enumerate(UNITS)}
-        return MemberCurves(self.domain.time, estimate, members, np.stack(self._pressure), np.stack(self._sigma))
+        estimate = {name: curves[:, 0, k] for k, name in enumerate(self.kind.units)}
+        members = {name: curves[:, 1:, k].T for k, name in enumerate(self.kind.units)}
+        pressure, sigma = (np.stack(fields) if fields else None for fields in (self._pressure, self._sigma))
+        return MemberCurves(self.domain.time, self.kind, estimate, members, pressure, sigma)
 
     def state(self) -> dict[str, Any]:
         """What a checkpoint has to hold."""
@@ -143,8 +149,10 @@ class MemberQuantities:
             [np.asarray(each) for each in state[name]] for name in ("curves", "pressure", "sigma")
         )
 
-    def _gauged(self, pressure: NDArray[np.floating], of_frame: FrameQuantities) -> NDArray[np.float32]:
+    def _gauged(self, pressure: NDArray[np.floating], of_frame: DomainFrame) -> NDArray[np.float32]:
         """A pressure `(*shape)`, Pa, less its mean around the inlet; 0 outside the mask."""
+        if not np.isfinite(of_frame.base).all():
+            return np.where(of_frame.mask, pressure, 0.0).astype(np.float32)
         probe = PROBE * min(self.domain.grid.spacing)
         upper = of_frame.base - probe * of_frame.axis
         at_base = region_mean(pressure, of_frame.mask, self.domain.grid, upper, probe)
@@ -153,7 +161,7 @@ class MemberQuantities:
 
 def with_pressure(recording: geometry.Recording, curves: MemberCurves | None) -> geometry.Recording:
     """A recording with the pressure and its deviation that have been read out of it; without any, as it is."""
-    if curves is None:
+    if curves is None or curves.pressure is None:
         return recording
     return replace(recording, pressure=curves.pressure, pressure_sigma=curves.pressure_sigma)
 
