@@ -17,7 +17,7 @@ from tqdm import tqdm
 
 import geometry
 from torchsph.evaluation.metrics import evaluate, filled_velocity
-from torchsph.haemodynamics.quantities import FlowDomain
+from torchsph.haemodynamics import FlowDomain
 from torchsph.methods.by_name import run_methods
 
 from ..provenance import ANALYSES, ROOT, provenance
