@@ -39,8 +39,8 @@ class MemberCurves:
         coarser: of the analysis as the measurement's kernel would show it once more, `(T,)`; None where none is known.
         pressure: `(T, *shape)`, Pa, the simulator's own where there is one, else that of the velocities; its mean at
             the inlet is 0. None in a plane that blood passes through, whose velocities do not give it.
-        pressure_sigma: `(T, *shape)`, Pa, standard deviation over the members, and what the kernel takes once more; None
-            like it.
+        pressure_sigma: `(T, *shape)`, Pa, standard deviation over the members, and what the kernel takes once more;
+            None like it.
     """
 
     time: Array
