@@ -19,7 +19,7 @@ from geometry.surfaces.files import holds_surface
 from .assemble import Fields
 from .displacement import MotionOptions
 from .field_map import FieldMap
-from .own_files import own_recording
+from .own.files import own_recording
 from .readers.hdf5 import text
 from .series import read_fields
 from .source import FormatError, refuse_streams, understood

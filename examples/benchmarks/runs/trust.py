@@ -4,7 +4,7 @@
     python examples/benchmarks/mutants.py --mutants 500 --seed 5 --out mutants.json
     python examples/benchmarks/soak.py --scenes 60 --seed 7 --out soak.json
     python examples/benchmarks/runs/memory.py --out memory.json
-    python examples/benchmarks/trust.py --abuses abuses.json --mutants mutants.json \\
+    python examples/benchmarks/runs/trust.py --abuses abuses.json --mutants mutants.json \\
         --soak soak.json --memory memory.json
 
 A part that is not named keeps what the table has of it, with the commit of its own run.
@@ -20,12 +20,12 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 sys.path.insert(0, str(ROOT))
 
 from examples.provenance import provenance, write_table  # noqa: E402
 
-TABLE = Path(__file__).parent / "results" / "trust.json"
+TABLE = Path(__file__).parents[1] / "results" / "trust.json"
 PACKAGES = ("geometry", "regularize", "torchsph")
 Rows = list[dict[str, Any]]
 

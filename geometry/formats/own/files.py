@@ -17,12 +17,12 @@ from geometry.recordings.odd_files import PACKED, UNWRITTEN
 from geometry.recordings.read import read_recording
 from geometry.recordings.recording import Recording
 
-from .assemble import Fields
-from .field_map import FieldMap
-from .labelled_arrays import from_xarray
-from .own_mark import MARK, SOURCE, Mark
-from .series import read_fields
-from .source import FormatError
+from ..assemble import Fields
+from ..field_map import FieldMap
+from ..labelled_arrays import from_xarray
+from ..series import read_fields
+from ..source import FormatError
+from .mark import MARK, SOURCE, Mark
 
 SCALARS = ("pressure", "pressure_sigma")
 LONGEST = 1 << 30  # characters of a mark
