@@ -110,8 +110,9 @@ def _of_matlab(path: Path) -> str | None:
 
 def _of_vtkhdf(path: Path) -> str | None:
     with h5py.File(path, "r") as file:
-        hard = isinstance(file.get(MARK, getlink=True), h5py.HardLink)
-        node = file[MARK] if hard else None
+        if not isinstance(file.get(MARK, getlink=True), h5py.HardLink):
+            return None
+        node: Any = file[MARK]
         own = isinstance(node, h5py.Dataset) and node.shape == () and node.external is None
         value = node[()] if own else None
     return value.decode("utf-8") if isinstance(value, bytes) else None
@@ -256,7 +257,8 @@ def _fields(files: Sequence[Path], said: FieldMap, mark: Mark) -> dict[str, np.n
         elif name == "beam":
             beam = tuple(f"beam_{letter}" for letter in "xyz") if len(said.velocity) > 1 else (_beam(said),)
             found[name] = read_fields(files, replace(said, velocity=beam, sigma=()), "").velocity
-    return {name: _flat(found[name], first, mark) for name in mark.fields if found.get(name) is not None}  # type: ignore[misc]
+    there = {name: values for name, values in found.items() if name in mark.fields and values is not None}
+    return {name: _flat(values, first, mark) for name, values in there.items()}
 
 
 def _beam(said: FieldMap) -> str:

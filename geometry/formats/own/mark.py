@@ -72,12 +72,12 @@ class Mark:
         try:
             content = json.loads(text)
             shape = tuple(int(size) for size in content["shape"])
-            places = (tuple(float(value) for value in content[name]) for name in ("origin", "spacing"))
-            about = {name: float(content[name]) for name in NUMBERS}
+            origin, spacing = (tuple(float(value) for value in content[name]) for name in ("origin", "spacing"))
+            about: dict[str, Any] = {name: float(content[name]) for name in NUMBERS}
             about |= {"description": str(content["description"]), "cut": bool(content["cut"])}
             fields = tuple(name for name in FIELDS if name in content["fields"])
             arrays = {str(name): _unpacked(one) for name, one in content["arrays"].items()}
-            grid = Grid(*places, shape)
+            grid = Grid(origin, spacing, shape)
             if "/time" not in arrays or "velocity" not in fields or grid.dimension not in (2, 3):
                 raise ValueError("times, velocity or grid are missing")
         except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError, zlib.error) as fault:
