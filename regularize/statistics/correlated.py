@@ -16,11 +16,12 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from scipy.optimize import minimize_scalar
-from scipy.sparse import coo_array, csr_array
+from scipy.sparse import coo_array
 from scipy.spatial import cKDTree
 
 from regularize.rows.operators import System, VectorRows
 from regularize.rows.ordering import Ordering
+from regularize.rows.sparse import value_matrix
 from regularize.solvers.factor import Factor
 
 from .waves import Lattice
@@ -116,7 +117,7 @@ class CorrelatedErrors:
         if not isinstance(fit, VectorRows):
             raise TypeError(f"correlated errors are those of full vectors, not of {type(fit).__name__}")
         self.fit = fit
-        self.matrix = _matrix(fit, ordering)
+        self.matrix = value_matrix(fit, ordering)
         self.adjoint = self.matrix.T.tocsr()
         self.weight = weight[:, None, None]
         self.points = torch.tensor(self.fit.knots.spacing) * (self.fit.cell + self.fit.t)
@@ -173,16 +174,6 @@ class CorrelatedErrors:
     def _at_samples(self, x: torch.Tensor) -> torch.Tensor:
         """Fields (n, C, DRAWS) at the samples of coefficients (active, C, DRAWS) in solve order."""
         return torch.from_numpy(self.matrix @ x.flatten(1).numpy()).view(-1, *x.shape[1:])
-
-
-def _matrix(fit: VectorRows, ordering: Ordering) -> csr_array:
-    """(n, active) values of the coefficients' functions, in solve order, at the samples."""
-    nodes, values = fit.knots.local_nodes(fit.cell), fit.rows_at(slice(None)).double()
-    place = torch.empty(fit.knots.nodes, dtype=torch.int64)
-    place[ordering.nodes] = torch.arange(len(ordering.nodes))
-    starts = np.arange(0, nodes.numel() + 1, nodes.shape[1])
-    shape = (len(nodes), len(ordering.nodes))
-    return csr_array((values.flatten().numpy(), place[nodes].flatten().numpy(), starts), shape=shape)
 
 
 def _towards(errors: Correlation, seen: Correlation, left: Correlation) -> Correlation:
