@@ -8,7 +8,7 @@ import numpy as np
 import geometry
 import torchsph as ts
 from torchsph.data import sample_measurement, sample_truth
-from torchsph.haemodynamics.quantities import FlowDomain, flow_quantities
+from torchsph.haemodynamics import FlowDomain, flow_quantities
 
 
 def curves(recording: geometry.Recording) -> dict[str, np.ndarray]:

@@ -6,7 +6,7 @@ import numpy as np
 
 import geometry
 from torchsph.evaluation.metrics import evaluate
-from torchsph.haemodynamics.quantities import FlowDomain, flow_quantities
+from torchsph.haemodynamics import FlowDomain, flow_quantities
 
 READ_OUT = ("energy_loss", "pressure_difference")
 

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 import geometry
 from torchsph.evaluation.frames import matching_frames
 from torchsph.evaluation.metrics import filled_velocity, gaps
-from torchsph.haemodynamics.beat import BEAT_UNITS, beat_numbers
-from torchsph.haemodynamics.quantities import UNITS, FlowDomain, flow_quantities
+from torchsph.haemodynamics.domain import FlowDomain
+from torchsph.haemodynamics.quantities import Catalogue, catalogue, flow_quantities
 from torchsph.haemodynamics.uncertainty import Summary, coverage
 from torchsph.methods.members.quantities import MemberCurves
 
@@ -32,6 +32,13 @@ CAUTION = (
     "fields, too large in raw ones), helicity; kinetic energy is too small by about an eighth, and members' bands of "
     "energies, losses and vorticity hold half of the true values. For research, not for clinical use."
 )
+
+PLANE_CAUTION = (
+    "Of a plane, per metre of depth; the energy loss is that of the shear within the plane alone. Left out, because "
+    "they need the flow in space: volumes and fractions of them, forces, helicity, vortex rings, transit of blood"
+)
+
+CUT_CAUTION = ", and the pressure (from a plane that blood passes through, a third of its difference is wrong)"
 
 
 def plain_curves(recording: geometry.Recording) -> Curves:
@@ -53,12 +60,14 @@ class QuantityTables:
 
     Attributes:
         time: (T,), s.
-        curves: by their source ("analysis", "truth"), then by the names of ``UNITS``, (T,).
-        bands: of the members, by the names of ``UNITS``; none without members.
+        kind: which quantities there are.
+        curves: by their source ("analysis", "truth"), then by the names of the quantities, (T,).
+        bands: of the members, by the same names; none without members.
         beat_bands: of the numbers of the beat.
     """
 
     time: NDArray[np.float64]
+    kind: Catalogue
     curves: dict[str, Curves]
     bands: dict[str, Summary] = field(default_factory=dict)
     beat_bands: dict[str, Summary] = field(default_factory=dict)
@@ -71,19 +80,22 @@ class QuantityTables:
         truth: geometry.Recording | None = None,
     ) -> QuantityTables:
         """Of an analysis, of its members where they have been read out, and of the truth's frames at its times."""
+        kind = catalogue(recording.dimension, recording.cut)
         if members is None:
-            made = cls(recording.time, {"analysis": plain_curves(recording)})
+            made = cls(recording.time, kind, {"analysis": plain_curves(recording)})
         else:
             # what is quadratic in the velocity is too small in the analysis itself: its best value is the members' mean
-            made = cls(recording.time, {"analysis": members.estimate}, members.bands(), members.beat_bands())
+            made = cls(recording.time, kind, {"analysis": members.estimate}, members.bands(), members.beat_bands())
         if truth is not None:
+            if (truth.dimension, truth.cut) != (recording.dimension, recording.cut):
+                raise ValueError("the truth and the analysis must both be of space, of a plane flow, or of a cut plane")
             made.curves["truth"] = plain_curves(truth.select(matching_frames(recording.time, truth.time, "the truth")))
         return made
 
     @property
     def beat(self) -> dict[str, Curves]:
         """Numbers of the beat by their source."""
-        return {name: beat_numbers(self.time, curves) for name, curves in self.curves.items()}
+        return {name: self.kind.beat(self.time, curves) for name, curves in self.curves.items()}
 
     def document(self, config: Mapping[str, Any]) -> dict[str, Any]:
         """The content of `quantities.json`."""
@@ -97,13 +109,21 @@ class QuantityTables:
                 members["members"]["coverage"] = self.coverage()
         return {
             "time": self.time,
-            "units": UNITS | BEAT_UNITS,
+            "units": {**self.kind.units, **self.kind.beat_units},
             "curves": self.curves,
             "beat": self.beat,
             **members,
-            "caution": CAUTION,
+            "caution": self.caution,
             "config": dict(config),
         }
+
+    @property
+    def caution(self) -> str:
+        """What not to believe, and what is left out."""
+        if "volume" in self.kind.units:
+            return CAUTION
+        pressed = "pressure_difference" in self.kind.units
+        return f"{PLANE_CAUTION}{'' if pressed else CUT_CAUTION}. {CAUTION}"
 
     def coverage(self) -> dict[str, float]:
         """Share of the truth's frames inside the members' band, by quantity."""
@@ -112,12 +132,14 @@ class QuantityTables:
     def write(self, folder: Path, config: Mapping[str, Any]) -> None:
         """`quantities.json` and `quantities.csv`."""
         write_json(folder / "quantities.json", self.document(config))
-        columns = [(f"{source} {name}", name, self.curves[source][name]) for source in self.curves for name in UNITS]
+        columns = [
+            (f"{source} {name}", name, self.curves[source][name]) for source in self.curves for name in self.kind.units
+        ]
         for name, band in self.bands.items():
             columns += [(f"members {name} {part}", name, values) for part, values in band._asdict().items()]
         with (folder / "quantities.csv").open("w", newline="", encoding="utf-8") as file:
             writer = csv.writer(file)
-            writer.writerow(["time [s]", *(f"{label} [{UNITS[name]}]" for label, name, _ in columns)])
+            writer.writerow(["time [s]", *(f"{label} [{self.kind.units[name]}]" for label, name, _ in columns)])
             for frame, t in enumerate(self.time):
                 writer.writerow([f"{t:.9g}", *(f"{values[frame]:.9g}" for _, _, values in columns)])
 
@@ -127,21 +149,21 @@ class QuantityTables:
         heads = ["quantity", "unit", "analysis", *(["members", "+-"] if banded else [])]
         rows = [heads + (["truth", "error"] if compared else []) + (["in band"] if compared and banded else [])]
         inside = self.coverage() if compared and banded else {}
-        for name, unit in UNITS.items():
-            row = [f"{name} (RMS)", unit, f"{_rms(self.curves['analysis'][name]):.4g}"]
+        for name, unit in self.kind.units.items():
+            row = [f"{name} (RMS)", unit, _number(_rms(self.curves["analysis"][name]))]
             best = self.curves["analysis"][name]
             if banded:
                 best = self.bands[name].mean
-                row += [f"{_rms(best):.4g}", f"{_rms(self.bands[name].deviation):.2g}"]
+                row += [_number(_rms(best)), _number(_rms(self.bands[name].deviation), 2)]
             if compared:
                 true = self.curves["truth"][name]
-                row += [f"{_rms(true):.4g}", f"{_rms(best - true) / _rms(true):.3f}" if _rms(true) > 0 else "-"]
+                row += [_number(_rms(true)), f"{_rms(best - true) / _rms(true):.3f}" if _rms(true) > 0 else "-"]
             rows.append(row + ([f"{inside[name]:.2f}"] if inside else []))
         return rows + self._beat_rows(compared, banded)
 
     def _beat_rows(self, compared: bool, banded: bool) -> list[list[str]]:
         rows, beat = [], self.beat
-        for name, unit in BEAT_UNITS.items():
+        for name, unit in self.kind.beat_units.items():
             best = float(beat["analysis"][name])
             row = [name, unit, _number(best)]
             if banded:
@@ -163,22 +185,22 @@ class QuantityTables:
             "  ".join(cell.ljust(34) if n == 0 else cell.rjust(10) for n, cell in enumerate(row)).rstrip()
             for row in rows
         ]
-        return [*text, CAUTION]
+        return [*text, self.caution]
 
 
 def methods_read_out(args: argparse.Namespace, methods: Sequence[str], measured: geometry.Recording) -> tuple[str, ...]:
     """The methods whose members are read out, as the options of a run ask for it.
 
     Raises:
-        ValueError: options that cannot be together, or a plane recording whose quantities are asked for outright.
+        ValueError: options that cannot be together, or a recording without walls whose quantities are asked for.
     """
     if args.keep_members and ("ensemble" not in methods or args.lag is not None):
         raise ValueError("--keep-members: only the ensemble has members, and with --lag they change after their time")
     if args.quantities and args.no_quantities:
         raise ValueError("--quantities and --no-quantities cannot be together")
-    if args.quantities and (measured.dimension != 3 or measured.wall is None):
-        raise ValueError("--quantities: those of a whole flow need a recording in space with walls (/wall)")
-    if args.no_quantities or measured.dimension != 3 or measured.wall is None:
+    if args.quantities and measured.wall is None:
+        raise ValueError("--quantities: those of a whole flow need a recording with walls (/wall)")
+    if args.no_quantities or measured.wall is None:
         return ()
     if "ensemble" in methods:
         return ("ensemble",) if args.lag is None else ()
@@ -186,7 +208,8 @@ def methods_read_out(args: argparse.Namespace, methods: Sequence[str], measured:
 
 
 def _rms(values: NDArray[np.float64]) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))
+    known = values[np.isfinite(values)]
+    return float(np.sqrt(np.mean(np.square(known)))) if len(known) else float("nan")
 
 
 def _number(value: float, digits: int = 4) -> str:

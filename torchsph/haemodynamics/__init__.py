@@ -4,8 +4,9 @@ Pure functions of arrays (velocity, mask, spacing, walls) in SI units; formulas 
 `README.md` here.
 """
 
-from .beat import BEAT_UNITS, beat_numbers
+from .beat import BEAT_UNITS, CUT_BEAT_UNITS, PLANE_BEAT_UNITS, beat_numbers, plane_beat_numbers
 from .circulation import PlaneCirculation, contour_circulation, plane_circulation
+from .domain import FieldQuantities, FlowDomain, long_axis
 from .energy import dissipation, energy_loss, integral, kinetic_energy, kinetic_energy_density
 from .fields.acceleration import material_acceleration, pressure_gradient, time_derivative
 from .fields.derivatives import Derivatives, WallSamples
@@ -23,16 +24,22 @@ from .force import axial_components, haemodynamic_force
 from .lagrangian.flow_components import FlowComponents, flow_components
 from .lagrangian.moving_flow import MovingFlow, MovingWalls
 from .lagrangian.tracers import Tracers, carry, residence_time, seed_blood
+from .plane_quantities import CUT_UNITS, PLANE_UNITS, PlaneQuantities
 from .pressure import PressureSolver, pressure_difference, region_mean
-from .quantities import UNITS, FieldQuantities, FlowDomain, FrameQuantities, flow_quantities, long_axis
-from .uncertainty import RunningMoments, Summary, around, coverage, summary
-from .vortices import PlaneVortex, VortexRing, main_vortex, vortex_cores, vortex_ring
-from .vorticity import helicity_density, lambda2, q_criterion, vorticity
+from .quantities import UNITS, Catalogue, FrameQuantities, catalogue, flow_quantities
+from .uncertainty import RunningMoments, Summary, around, coverage, summary, unresolved
+from .vortices import PlaneCore, PlaneVortex, VortexRing, main_vortex, plane_cores, vortex_cores, vortex_ring
+from .vorticity import helicity_density, lambda2, q_criterion, swirl, vorticity
 from .wall_shear import WallShear
 
 __all__ = [
     "BEAT_UNITS",
+    "CUT_BEAT_UNITS",
+    "CUT_UNITS",
+    "PLANE_BEAT_UNITS",
+    "PLANE_UNITS",
     "UNITS",
+    "Catalogue",
     "Derivatives",
     "FieldQuantities",
     "FillingPeaks",
@@ -43,6 +50,8 @@ __all__ = [
     "MovingWalls",
     "OpeningFlow",
     "PlaneCirculation",
+    "PlaneCore",
+    "PlaneQuantities",
     "PlaneSection",
     "PlaneVortex",
     "PressureSolver",
@@ -56,6 +65,7 @@ __all__ = [
     "axial_components",
     "beat_numbers",
     "carry",
+    "catalogue",
     "contour_circulation",
     "coverage",
     "dissipation",
@@ -72,7 +82,9 @@ __all__ = [
     "long_axis",
     "main_vortex",
     "material_acceleration",
+    "plane_beat_numbers",
     "plane_circulation",
+    "plane_cores",
     "plane_flow",
     "plane_section",
     "pressure_difference",
@@ -86,7 +98,9 @@ __all__ = [
     "seed_blood",
     "stroke_volume",
     "summary",
+    "swirl",
     "time_derivative",
+    "unresolved",
     "vortex_cores",
     "vortex_ring",
     "vorticity",

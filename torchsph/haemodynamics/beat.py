@@ -25,7 +25,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from .flow_rate import FillingPeaks, e_and_a, regurgitant_fraction, stroke_volume
 
-__all__ = ["BEAT_UNITS", "beat_numbers"]
+__all__ = ["BEAT_UNITS", "CUT_BEAT_UNITS", "PLANE_BEAT_UNITS", "beat_numbers", "plane_beat_numbers"]
 
 Array = NDArray[np.float64]
 
@@ -50,6 +50,29 @@ BEAT_UNITS = {
     "pressure_difference_lowest_time": "s",
 }
 
+_DROP_UNITS = {name: unit for name, unit in BEAT_UNITS.items() if name.startswith("pressure_difference")}
+
+CUT_BEAT_UNITS = {
+    "area_change": "m2",
+    "fractional_area_change": "1",
+    "outflow": "m2",
+    "inflow": "m2",
+    "e_wave": "m2/s",
+    "a_wave": "m2/s",
+    "e_over_a": "1",
+    "e_time": "s",
+    "a_time": "s",
+    "energy_lost": "J/m",
+    "kinetic_energy_mean": "J/m",
+    "kinetic_energy_peak": "J/m",
+    "vortex_positive_peak": "m2/s",
+    "vortex_positive_peak_time": "s",
+    "vortex_negative_peak": "m2/s",
+    "vortex_negative_peak_time": "s",
+}
+
+PLANE_BEAT_UNITS = CUT_BEAT_UNITS | _DROP_UNITS
+
 
 def beat_numbers(time: ArrayLike, curves: Mapping[str, ArrayLike]) -> dict[str, Array]:
     """Every number of `BEAT_UNITS`, each `(*batch)`.
@@ -60,11 +83,8 @@ def beat_numbers(time: ArrayLike, curves: Mapping[str, ArrayLike]) -> dict[str, 
     """
     times = np.asarray(time, np.float64)
     arrays = {name: np.asarray(curve, np.float64) for name, curve in curves.items()}
-    volume, energy, drop = (arrays[name] for name in ("volume", "kinetic_energy", "pressure_difference"))
+    volume = arrays["volume"]
     largest = volume.max(-1)
-    span = float(times[-1] - times[0])
-    highest, lowest = _extreme(times, drop), _extreme(times, -drop)
-    waves = np.apply_along_axis(lambda curve: _waves(times, curve), -1, arrays["flow_inlet"])
     return {
         "stroke_volume_wall": largest - volume.min(-1),
         "ejection_fraction": (largest - volume.min(-1)) / largest,
@@ -72,14 +92,59 @@ def beat_numbers(time: ArrayLike, curves: Mapping[str, ArrayLike]) -> dict[str, 
         "filling_volume": stroke_volume(times, arrays["flow_inlet"]),
         "regurgitant_fraction_inlet": regurgitant_fraction(times, arrays["flow_inlet"]),
         "regurgitant_fraction_outlet": regurgitant_fraction(times, arrays["flow_outlet"]),
-        "e_wave": waves[..., 0],
-        "a_wave": waves[..., 1],
-        "e_over_a": waves[..., 4],
-        "e_time": waves[..., 2],
-        "a_time": waves[..., 3],
+        **_filling(times, arrays["flow_inlet"]),
+        **_energies(times, arrays),
+        **_drops(times, arrays["pressure_difference"]),
+    }
+
+
+def plane_beat_numbers(time: ArrayLike, curves: Mapping[str, ArrayLike]) -> dict[str, Array]:
+    """Every number of `PLANE_BEAT_UNITS`, or of `CUT_BEAT_UNITS` where the curves have no pressure, each `(*batch)`.
+
+    Args:
+        time: `(T,)`, s.
+        curves: by the names of `plane_quantities.PLANE_UNITS`, `(*batch, T)`.
+    """
+    times = np.asarray(time, np.float64)
+    arrays = {name: np.asarray(curve, np.float64) for name, curve in curves.items()}
+    area = arrays["area"]
+    largest = area.max(-1)
+    turning, back = _extreme(times, arrays["vortex_positive"]), _extreme(times, -arrays["vortex_negative"])
+    return {
+        "area_change": largest - area.min(-1),
+        "fractional_area_change": (largest - area.min(-1)) / largest,
+        "outflow": stroke_volume(times, arrays["flow_outlet"]),
+        "inflow": stroke_volume(times, arrays["flow_inlet"]),
+        **_filling(times, arrays["flow_inlet"]),
+        **_energies(times, arrays),
+        "vortex_positive_peak": turning[..., 1],
+        "vortex_positive_peak_time": turning[..., 0],
+        "vortex_negative_peak": -back[..., 1],
+        "vortex_negative_peak_time": back[..., 0],
+        **(_drops(times, arrays["pressure_difference"]) if "pressure_difference" in arrays else {}),
+    }
+
+
+def _filling(times: Array, inflow: Array) -> dict[str, Array]:
+    """First and last wave of the inflow `(*batch, T)`."""
+    waves = np.apply_along_axis(lambda curve: _waves(times, curve), -1, inflow)
+    names = {"e_wave": 0, "a_wave": 1, "e_over_a": 4, "e_time": 2, "a_time": 3}
+    return {name: waves[..., place] for name, place in names.items()}
+
+
+def _energies(times: Array, arrays: Mapping[str, Array]) -> dict[str, Array]:
+    energy, span = arrays["kinetic_energy"], float(times[-1] - times[0])
+    return {
         "energy_lost": np.trapezoid(arrays["energy_loss"], times, axis=-1),
         "kinetic_energy_mean": np.trapezoid(energy, times, axis=-1) / span,
         "kinetic_energy_peak": energy.max(-1),
+    }
+
+
+def _drops(times: Array, drop: Array) -> dict[str, Array]:
+    """Highest and lowest pressure difference of a curve `(*batch, T)`, and when."""
+    highest, lowest = _extreme(times, drop), _extreme(times, -drop)
+    return {
         "pressure_difference_highest": highest[..., 1],
         "pressure_difference_highest_time": highest[..., 0],
         "pressure_difference_lowest": -lowest[..., 1],

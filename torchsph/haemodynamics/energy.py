@@ -39,7 +39,7 @@ def kinetic_energy_density(velocity: ArrayLike, mask: ArrayLike, rho: float, sig
         sigma: standard deviation of each component, like `velocity`, m/s; its variance is added.
     """
     inside = np.asarray(mask, bool)
-    axis = -1 - _dimension(velocity)
+    axis = -1 - _dimension(velocity, inside.ndim)
     square = (np.asarray(velocity, np.float64) ** 2).sum(axis)
     if sigma is not None:
         square = square + (np.asarray(sigma, np.float64) ** 2).sum(axis)
@@ -128,10 +128,10 @@ def integral(density: ArrayLike, mask: ArrayLike, cell_volume: float, volume: fl
     return total * (cell_volume if volume is None else volume / nodes)
 
 
-def _dimension(velocity: ArrayLike) -> int:
-    """D of a velocity `(*batch, D, *shape)`."""
+def _dimension(velocity: ArrayLike, axes: int) -> int:
+    """D of a velocity `(*batch, D, *shape)`; where a batch of three planes looks like a volume, that of the mask."""
     shape = np.shape(velocity)
-    for dimension in (3, 2):
-        if len(shape) > dimension and shape[-1 - dimension] == dimension:
-            return dimension
+    fitting = [one for one in (3, 2) if len(shape) > one and shape[-1 - one] == one]
+    if fitting:
+        return axes if axes in fitting else fitting[0]
     raise ValueError(f"a velocity must be (..., D, *shape) with D of 2 or 3, not {shape}")

@@ -33,7 +33,7 @@ import geometry
 
 from .fields.sampling import PlaneSection
 
-__all__ = ["PlaneVortex", "VortexRing", "main_vortex", "vortex_cores", "vortex_ring"]
+__all__ = ["PlaneCore", "PlaneVortex", "VortexRing", "main_vortex", "plane_cores", "vortex_cores", "vortex_ring"]
 
 Array = NDArray[np.float64]
 
@@ -142,6 +142,41 @@ def main_vortex(gradient: ArrayLike, section: PlaneSection) -> PlaneVortex | Non
         intensity,
         (last - first) / (top - bottom),
     )
+
+
+class PlaneCore(NamedTuple):
+    """A vortex of a plane recording: circulation, m^2/s, area, m^2, centre `(2,)`, m, weighted with abs(omega)."""
+
+    circulation: float
+    area: float
+    centre: Array
+
+
+def plane_cores(
+    vorticity: ArrayLike, turning: ArrayLike, grid: geometry.Grid
+) -> tuple[PlaneCore | None, PlaneCore | None]:
+    """The vortex of the largest circulation that turns from x to y, and the one that turns back; `None` without one.
+
+    Args:
+        vorticity: `(ny, nx)`, 1/s.
+        turning: bool `(ny, nx)`, nodes of the blood at which paths turn (`vorticity.swirl` above 0).
+        grid: the nodes.
+    """
+    curl, inside = np.asarray(vorticity, np.float64), np.asarray(turning, bool)
+    found = [_strongest(np.where(inside, np.maximum(sign * curl, 0.0), 0.0), sign, grid) for sign in (1, -1)]
+    return found[0], found[1]
+
+
+def _strongest(size: Array, sign: int, grid: geometry.Grid) -> PlaneCore | None:
+    """The connected region of the largest sum of `size` `(ny, nx)`."""
+    labels, count = label(size > 0)
+    if not count:
+        return None
+    sums = np.bincount(labels.ravel(), weights=size.ravel(), minlength=count + 1)[1:]
+    chosen = np.flatnonzero(labels.ravel() == 1 + int(sums.argmax()))
+    weight = size.ravel()[chosen]
+    centre = weight @ grid.nodes().numpy()[chosen] / weight.sum()
+    return PlaneCore(sign * float(weight.sum()) * grid.cell_volume, len(chosen) * grid.cell_volume, centre)
 
 
 def _extent(ticks: Array, used: NDArray[np.bool_]) -> tuple[float, float]:

@@ -6,9 +6,12 @@
 | `helicity_density` | u . omega | m/s^2 |
 | `q_criterion` | Q = (abs(W)^2 - abs(S)^2) / 2, S and W the symmetric and antisymmetric part of G | 1/s^2 |
 | `lambda2` | middle eigenvalue of S^2 + W^2 | 1/s^2 |
+| `swirl` | det G - (tr G)^2 / 4 of a plane: the square of the angular speed at which paths turn | 1/s^2 |
 
 Vortices are where Q > 0 (Hunt, Wray & Moin 1988), or lambda2 < 0 (Jeong & Hussain 1995): a local minimum of
-pressure across two axes. In a plane flow lambda2 = -Q for a divergence of zero.
+pressure across two axes. In a plane flow lambda2 = -Q for a divergence of zero. In a plane that blood passes through
+the divergence is not zero; there paths turn where the eigenvalues of G are a complex pair, so that `swirl` > 0 (Chong,
+Perry & Cantwell 1990); without divergence that is Q.
 
 All take `gradient` `(*batch, D, D, *shape)`, whatever it was computed by, and return fields over `(*batch, *shape)`.
 """
@@ -18,7 +21,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["helicity_density", "lambda2", "q_criterion", "tensor_axes", "vorticity"]
+__all__ = ["helicity_density", "lambda2", "q_criterion", "swirl", "tensor_axes", "vorticity"]
 
 Array = NDArray[np.float64]
 
@@ -79,6 +82,21 @@ def lambda2(gradient: ArrayLike) -> Array:
     if dimension == 2:
         values = np.sort(np.concatenate([values, np.zeros_like(values[..., :1])], axis=-1), axis=-1)
     return np.asarray(values[..., 1], np.float64)
+
+
+def swirl(gradient: ArrayLike) -> Array:
+    """Square of the imaginary part of the eigenvalues of a plane's gradient `(*batch, 2, 2, ny, nx)`, 1/s^2.
+
+    Below 0 they are real, and no path turns.
+
+    Raises:
+        ValueError: the gradient is one in space.
+    """
+    tensor, dimension = tensor_axes(gradient)
+    if dimension != 2:
+        raise ValueError("swirl: the gradient must be that of a plane, (..., 2, 2, ny, nx)")
+    across, along = tensor[..., 0, 0], tensor[..., 1, 1]
+    return -tensor[..., 0, 1] * tensor[..., 1, 0] - 0.25 * (across - along) ** 2
 
 
 def _parts(tensor: Array) -> tuple[Array, Array]:

@@ -145,8 +145,14 @@ CAVITY_OPTIONS: WeaklyCompressibleOptions = {
     "wall": CompleteKernelWall(sliding=True),
 }
 # Free surfaces: the switched pressure form is not conservative and feeds energy into a surface under tension (Sun et
-# al. 2017 keep the sum there), and shifting pushes particles out of it.
-FREE_SURFACE_OPTIONS: WeaklyCompressibleOptions = {"pressure": "sum", "shifting": None, "sound_speed": 10.0}
+# al. 2017 keep the sum there), and shifting pushes particles out of it. Drops of a few particles under tension would
+# spin out of hand.
+FREE_SURFACE_OPTIONS: WeaklyCompressibleOptions = {
+    "pressure": "sum",
+    "shifting": None,
+    "sound_speed": 10.0,
+    "least_density": 0.5,
+}
 # A stretched fluid (a rotating patch) tears from tensile instability by omega t = 1 unless it is evened out below its
 # surface; where a vacuum shall open, this shifting would fill it.
 STRETCHED_SURFACE_OPTIONS: WeaklyCompressibleOptions = {

@@ -13,6 +13,7 @@ class WeaklyCompressibleOptions(TypedDict, total=False):
     smoothing_ratio: float
     sound_speed: float
     pressure: str
+    least_density: float | None
     artificial_viscosity: float | None
     density_diffusion: float | None
     bulk_damping: float | None

@@ -7,6 +7,7 @@ import json
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 import geometry
 from torchsph.cli.main import main
@@ -35,11 +36,33 @@ def test_table_json_and_csv(tmp_path, capsys, box_recording):
     assert "flow_inlet (RMS)" in table and "0.500" in table and "wall shear stress" in table
 
 
-def test_faults_are_one_line(tmp_path, capsys, box_recording):
-    plane = box_recording(lambda points, time: 0 * points, dimension=2)
+@pytest.mark.parametrize("cut", [True, False])
+def test_a_plane_is_told_per_metre_of_depth(tmp_path, capsys, box_recording, cut):
+    plane = box_recording(
+        lambda points, time: np.tile([0.0, -(0.5 + 20 * time)], (len(points), 1)), dimension=2, cut=cut
+    )
     geometry.write_recording(tmp_path / "plane.h5", plane)
-    assert main(["quantify", str(tmp_path / "plane.h5"), "--out", str(tmp_path)]) == 2
-    assert "in space" in capsys.readouterr().err
+    assert (
+        main(["quantify", str(tmp_path / "plane.h5"), "--truth", str(tmp_path / "plane.h5"), "--out", str(tmp_path)])
+        == 0
+    )
+    document = json.loads((tmp_path / "quantities.json").read_text(encoding="utf-8"))
+    found = document["curves"]["analysis"]
+    np.testing.assert_allclose(found["kinetic_energy"], 0.5 * 1060 * (0.5 + 20 * plane.time) ** 2 * 1e-4, rtol=1e-6)
+    assert document["units"]["kinetic_energy"] == "J/m" and document["units"]["flow_inlet"] == "m2/s"
+    assert ("pressure_difference" in found) != cut
+    table = capsys.readouterr().out
+    assert "per metre of depth" in table and ("third of its difference" in table) == cut
+
+
+def test_faults_are_one_line(tmp_path, capsys, box_recording):
+    for name, cut in (("flow", False), ("cut", True)):
+        plane = box_recording(lambda points, time: 0 * points, dimension=2, cut=cut)
+        geometry.write_recording(tmp_path / f"{name}.h5", plane)
+    command = ["quantify", str(tmp_path / "flow.h5"), "--truth", str(tmp_path / "cut.h5"), "--out", str(tmp_path)]
+    assert main(command) == 2
+    told = capsys.readouterr().err
+    assert "cut plane" in told and len(told.strip().splitlines()) == 1
     assert not (tmp_path / "quantities.json").exists()
 
 

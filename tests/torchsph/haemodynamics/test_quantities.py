@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from torchsph.haemodynamics.beat import BEAT_UNITS, beat_numbers
-from torchsph.haemodynamics.quantities import UNITS, FlowDomain, flow_quantities, long_axis
+from torchsph.haemodynamics.domain import FlowDomain, long_axis
+from torchsph.haemodynamics.quantities import UNITS, flow_quantities
 
 TIMES = (0.0, 0.01, 0.02, 0.03)
 
@@ -61,8 +62,6 @@ def test_a_shut_valve_lets_nothing_through(box_recording):
 
 
 def test_what_does_not_fit_is_refused(box_recording, recording):
-    with pytest.raises(ValueError, match="in space"):
-        FlowDomain.from_recording(box_recording(lambda p, t: 0 * p, dimension=2))
     with pytest.raises(ValueError, match="must be"):
         flow_quantities(FlowDomain.from_recording(recording), recording.velocity[:2])
 

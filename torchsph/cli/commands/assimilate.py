@@ -30,7 +30,7 @@ from ..checks import check_spacing, informative, usable_device
 from ..command import Command
 from ..outputs import output_folder, staged, write_json, write_result
 from ..printing import print_table, run_config, say
-from ..quantity_tables import CAUTION, QuantityTables, methods_read_out
+from ..quantity_tables import QuantityTables, methods_read_out
 from ..running.folder_lock import locked
 from ..running.notes import shows_bar
 from ..running.provenance import provenance
@@ -219,7 +219,7 @@ def _write(
     print_table(figures.scores_table(scores, seconds))
     if tables is not None:
         print_table(tables.table())
-        say(CAUTION)
+        say(tables.caution)
     for words in results["ensemble"].info["filter"]["warnings"] if "ensemble" in results else ():
         say(f"ensemble: {words}")
     files = ", ".join(f"{name}.h5" for name in analyses)

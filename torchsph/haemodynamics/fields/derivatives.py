@@ -38,7 +38,11 @@ class WallSamples(NamedTuple):
     @classmethod
     def at(cls, sampler: geometry.WallSampler, t: float) -> WallSamples:
         """The points of `sampler` at time `t`, s, without those of orifices (regions above 0)."""
-        found = sampler.at(t)
+        return cls.of(sampler.at(t))
+
+    @classmethod
+    def of(cls, found: geometry.WallPoints) -> WallSamples:
+        """The points of the wall among those `found`, without those of orifices (regions above 0)."""
         wall = found.region == 0
         return cls(found.points[wall], found.velocities[wall])
 

@@ -32,6 +32,9 @@ class WeaklyCompressible(Scheme):
         background_pressure: p0 / rho0 in units of c^2 (0: none).
         hughes_graham: whether the Tait pressure is taken at max(rho, rho0) (Hughes & Graham 2010), which
             cannot pull.
+        least_density: over that at rest, below which no particle thins out, or None. A drop in free flight that has
+            come under tension spins, thins and is pulled the harder: a pair swings at sqrt(6.6 (1 - r)) c / (h r) for
+            a density r, and below r = 1/2 no acoustic step resolves that. Water cavitates long before.
         continuity: "volume" or "mass" (Grønli 2017, eq. 2.19) form of the density rate.
         pressure: form of the pressure force (``MomentumTerms``).
         artificial_viscosity: alpha (Grønli 2017, eq. 2.29), or None.
@@ -73,6 +76,7 @@ class WeaklyCompressible(Scheme):
     gamma: float = 1.0
     background_pressure: float = 0.0
     hughes_graham: bool = False
+    least_density: float | None = None
     continuity: str = "volume"
     pressure: str = "switched"
     artificial_viscosity: float | None = 0.02
@@ -121,6 +125,10 @@ class WeaklyCompressible(Scheme):
             value = getattr(self, name)
             if value is not None and value < 1:
                 raise ValueError(f"WeaklyCompressible.{name} must be at least 1 or None, got {value}")
+        if self.least_density is not None and not 0 < self.least_density < 1:
+            raise ValueError(
+                f"WeaklyCompressible.least_density must lie in (0, 1) or be None, got {self.least_density}"
+            )
         if self.step_floor is not None and not 0 < self.step_floor < 1:
             raise ValueError(f"WeaklyCompressible.step_floor must lie in (0, 1) or be None, got {self.step_floor}")
         self._check_combinations()

@@ -34,7 +34,7 @@ def symplectic_step(
     pairs = sums.pair_search.at(particles)
     filtering = sums.filter_due(number, step)
     rates = sums.rates(particles, pairs, wall, filtering)
-    particles = particles.changed(deviation=particles.deviation + dt * rates.density)
+    particles = sums.thinned(particles, dt * rates.density)
     particles = sums.filter_density(particles, rates.sums, filtering)
     acceleration = sums.acceleration(particles, pairs, rates.divergence, wall, around)
     velocity = sums.kick(particles, particles.velocity, dt, acceleration)
@@ -54,7 +54,7 @@ def thesis_step(
     pairs = sums.pair_search.at(particles)
     wall = around.sample(particles) if sums.scheme.wall.complete else None
     rates = sums.rates(particles, pairs, wall)
-    particles = particles.changed(deviation=particles.deviation + dt * rates.density)
+    particles = sums.thinned(particles, dt * rates.density)
     particles = particles.changed(position=particles.position + dt[:, None] * particles.velocity)
     pairs, wall = sums.pair_search.at(particles), around.sample(particles)
     acceleration = sums.acceleration(particles, pairs, rates.divergence, wall, around)
@@ -76,15 +76,13 @@ def verlet_step(
     middle = particles.changed(position=particles.position + 0.5 * dt[:, None] * particles.velocity)
     pairs, wall = sums.pair_search.at(middle), around.sample(middle)
     early = sums.rates(middle, pairs, wall)
-    middle = middle.changed(deviation=start.deviation + 0.5 * dt * early.density)
+    middle = sums.thinned(middle, 0.5 * dt * early.density)
     acceleration = sums.acceleration(middle, pairs, early.divergence, wall, around)
     velocity = sums.kick(start, start.velocity, dt, acceleration)
     mean = middle.changed(velocity=0.5 * (start.velocity + velocity))
     late = sums.rates(mean, pairs, wall)
     drift = 0.5 * dt[:, None] * velocity + sums.position_correction(mean, late, mean, step)
-    after = start.changed(
-        position=middle.position + drift, velocity=velocity, deviation=start.deviation + dt * late.density
-    )
+    after = sums.thinned(start, dt * late.density).changed(position=middle.position + drift, velocity=velocity)
     return Stepped(sums.damp_at_walls(after, wall, dt), acceleration, wall_at_start)
 
 
@@ -100,10 +98,9 @@ def predictor_corrector_step(
     pairs, wall_at_start = sums.pair_search.at(start), around.sample(start)
     first = sums.rates(start, pairs, wall_at_start)
     predicted = sums.acceleration(start, pairs, first.divergence, wall_at_start, around)
-    middle = start.changed(
+    middle = sums.thinned(start, half * first.density).changed(
         position=start.position + half[:, None] * start.velocity,
         velocity=sums.kick(start, start.velocity, half, predicted),
-        deviation=start.deviation + half * first.density,
     )
     pairs, wall = sums.pair_search.at(middle), around.sample(middle)
     second = sums.rates(middle, pairs, wall)
@@ -111,9 +108,7 @@ def predictor_corrector_step(
     velocity = sums.kick(start, start.velocity, dt, acceleration)
     drift = half[:, None] * (start.velocity + velocity)
     drift = drift + sums.position_correction(middle, second, middle, step)
-    after = start.changed(
-        position=start.position + drift, velocity=velocity, deviation=start.deviation + dt * second.density
-    )
+    after = sums.thinned(start, dt * second.density).changed(position=start.position + drift, velocity=velocity)
     return Stepped(sums.damp_at_walls(after, wall, dt), acceleration, wall_at_start)
 
 

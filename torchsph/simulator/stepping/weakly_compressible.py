@@ -145,6 +145,11 @@ class WeaklyCompressibleSums:
             rate = torch.where(torch.isin(particles.kind, self.prescribed_kinds), torch.zeros_like(rate), rate)
         return rate
 
+    def thinned(self, particles: Particles, change: Tensor) -> Particles:
+        """Particles whose density has changed by ``change`` (N,), none of them thinner than the scheme lets it be."""
+        deviation, least = particles.deviation + change, self.scheme.least_density
+        return particles.changed(deviation=deviation if least is None else deviation.clamp_min(least - 1.0))
+
     def pressure(self, particles: Particles, divergence: Tensor | None = None) -> Tensor:
         """p / rho0 (N,): equation of state, background (symmetric form only), damping of sound.
 
