@@ -6,6 +6,7 @@ from .motion.estimates import Estimates, estimated
 from .motion.moving_distance import MovingDistance, WallField, WallPoint
 from .motion.orifices import Orifice, OrificePlane, orifices
 from .motion.plane_cut import plane_cut
+from .motion.planes_in_space import PlacedPlane, planes_in_space
 from .motion.refine import refined, refined_motion
 from .motion.valve_times import ValveTimes, find_valve_times
 from .motion.wall_estimate import WallEstimate, estimate_wall
@@ -46,6 +47,7 @@ __all__ = [
     "Orifice",
     "OrificePlane",
     "Quality",
+    "PlacedPlane",
     "Recording",
     "RecordingError",
     "Stencil",
@@ -76,6 +78,7 @@ __all__ = [
     "openings",
     "orifices",
     "plane_cut",
+    "planes_in_space",
     "polygon",
     "read_provenance",
     "read_recording",
