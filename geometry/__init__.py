@@ -2,6 +2,7 @@
 
 from .grids.grid import Grid, Stencil
 from .grids.unwrapping import unwrap
+from .motion.beats import Repetition, repetition, split_beats, told_apart
 from .motion.estimates import Estimates, estimated
 from .motion.moving_distance import MovingDistance, WallField, WallPoint
 from .motion.orifices import Orifice, OrificePlane, orifices
@@ -46,10 +47,11 @@ __all__ = [
     "OpeningFlux",
     "Orifice",
     "OrificePlane",
-    "Quality",
     "PlacedPlane",
+    "Quality",
     "Recording",
     "RecordingError",
+    "Repetition",
     "Stencil",
     "Surface",
     "SurfaceError",
@@ -86,12 +88,15 @@ __all__ = [
     "refined",
     "refined_motion",
     "repaired",
+    "repetition",
     "revolved",
     "signed_distance",
+    "split_beats",
     "surface_from_mask",
     "surface_from_points",
     "surface_from_velocity",
     "taubin",
+    "told_apart",
     "tube",
     "unwrap",
     "wall_points",
