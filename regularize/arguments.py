@@ -253,7 +253,9 @@ def shown(value: Any) -> str:
     else:
         known = isinstance(value, int | float | complex | str | bytes | tuple | list | None)
         vast = isinstance(value, int) and abs(value) >= 2**1023  # more digits than Python may print
-        return type(value).__name__ if vast or not known else reprlib.repr(value)
+        if vast:
+            return f"one of {value.bit_length()} bits"
+        return reprlib.repr(value) if known else type(value).__name__
     broken = "" if not _is_plain(value) or _all_finite(value) else ", not all finite"
     return f"{kind}, of the shape {tuple(value.shape)}{broken}"
 

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from .methods.forecast_skill import ForecastSkill, skill
     from .methods.measurement.error_model import ObservationError, estimate_error
     from .methods.measurement.frame_splines import smooth
+    from .methods.measurement.over_time import AveragedOverTime, average_over_time
     from .methods.measurement.prepared import PreparedMeasurement as PreparedMeasurement
     from .methods.nudging import FilteredRun, filter_sph
     from .methods.resample import resample
@@ -49,6 +50,7 @@ __all__ = [
     "METHODS",
     "PRESETS",
     "XSPH",
+    "AveragedOverTime",
     "BetweenFrames",
     "CompleteKernelWall",
     "EnsembleOptions",
@@ -80,6 +82,7 @@ __all__ = [
     "WeaklyCompressible",
     "__version__",
     "assimilate",
+    "average_over_time",
     "default_filter",
     "estimate_error",
     "filter_sph",
@@ -124,6 +127,10 @@ _HOMES = {
         "estimate_error",
     ),
     "methods.measurement.frame_splines": ("smooth",),
+    "methods.measurement.over_time": (
+        "AveragedOverTime",
+        "average_over_time",
+    ),
     "methods.measurement.prepared": ("PreparedMeasurement",),
     "methods.nudging": (
         "FilteredRun",

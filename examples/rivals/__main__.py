@@ -19,6 +19,8 @@ import geometry
 from torchsph.evaluation.metrics import evaluate, filled_velocity
 from torchsph.haemodynamics import FlowDomain
 from torchsph.methods.by_name import run_methods
+from torchsph.methods.measurement.over_time import average_over_time
+from torchsph.methods.measurement.prepared import PreparedMeasurement
 
 from ..provenance import ANALYSES, ROOT, provenance
 from . import __doc__ as about
@@ -30,7 +32,7 @@ from .scores import read_out, scores
 TABLE = ROOT / "examples" / "rivals" / "results" / "rivals.json"
 METHODS = ROOT / "examples" / "benchmarks" / "results"
 SOURCES = ("examples/rivals/methods", "examples/rivals/frames.py", "examples/rivals/scores.py")
-OWN = ("spline", "ensemble")
+OWN = ("spline", "spline over time", "ensemble")
 NAMES = {
     "nrmse": "error",
     "direction_error_deg": "direction, °",
@@ -53,8 +55,10 @@ Written by `python -m examples.rivals`; all numbers and settings stand in `rival
 our own small implementation of somebody's idea, its settings chosen on a ventricle of another shape, beat and seed
 (`tuning.py`), never on what it is judged by. Errors are RMS errors over the RMS speed; energy loss and pressure
 difference are those of `torchsph.haemodynamics`; seconds are CPU seconds of one thread, of a network that is trained on
-other flows without its training. **spline** and **ensemble** are torchsph's own methods, with their defaults.
+other flows without its training. **spline** and **ensemble** are torchsph's own methods, with their defaults; **spline
+over time** is `torchsph smooth --over-time auto`.
 """
+OVER_TIME = " over time"
 COLUMNS = ("nrmse", "direction_error_deg", "divergence_rms", "energy_loss", "pressure_difference", "seconds")
 
 
@@ -98,14 +102,20 @@ def own(
     name: str, case: str, measured: geometry.Recording, run: Path | None, judge: Callable[[np.ndarray], dict[str, Any]]
 ) -> dict[str, Any]:
     """The row of a method of torchsph, from a folder of `torchsph assimilate` or made here."""
+    method, over_time = name.removesuffix(OVER_TIME), name.endswith(OVER_TIME)
     if run is not None:
-        found = geometry.read_recording(str(run / f"{name}.h5"))
+        found = geometry.read_recording(str(run / f"{method}.h5"))
         table = json.loads((METHODS / f"filter_methods_{case}.json").read_text(encoding="utf-8"))
-        seconds = table["rows"][name]["seconds"]
+        seconds = table["rows"][method]["seconds"]
     else:
         began = time.process_time()
-        found = run_methods(measured, (name,))[name].recording
+        found = run_methods(measured, (method,))[method].recording
         seconds = time.process_time() - began
+    if over_time:
+        prepared = PreparedMeasurement(measured, smoothed=found)
+        began = time.process_time()
+        found = average_over_time(found, prepared.splines, None, prepared.balance).recording
+        seconds += time.process_time() - began
     return judge(found.velocity) | {"seconds": round(seconds, 2), "from": provenance((*SOURCES, *ANALYSES))}
 
 

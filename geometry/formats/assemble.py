@@ -75,7 +75,7 @@ def assemble(source: Source, said: FieldMap) -> Fields:
     axes = [_axes(source, said, name, len(names) == 1) for name in names]
     sizes = [dict(zip(a, source.arrays[n].shape, strict=True)) for a, n in zip(axes, names, strict=True)]
     dimension = 3 if "z" in axes[0] else 2
-    _check_components(source, names, sizes, dimension)
+    _check_components(source, names, sizes, dimension, sizes[0])
     counts = tuple(sizes[0][letter] for letter in "xyz"[:dimension])
     frames = sizes[0].get("t", 1)
     _check_size(source, names[0], 4 * dimension * frames * math.prod(counts), f"{frames} frames of {counts} nodes")
@@ -89,6 +89,8 @@ def assemble(source: Source, said: FieldMap) -> Fields:
     if said.sigma:
         sigma = np.zeros_like(velocity)
         letters = [_axes(source, said, name, len(said.sigma) == 1) for name in said.sigma]
+        spread = [dict(zip(a, source.arrays[n].shape, strict=True)) for a, n in zip(letters, said.sigma, strict=True)]
+        _check_components(source, said.sigma, spread, dimension, sizes[0])
         fill_vectors(sigma, _vectors(source, said.sigma, letters, unit), lie, np.abs(matrix))
     whole = (frames, counts)
     mask = _scalar(source, said, said.mask or _role(source, "mask"), lie, whole, (bool, said.inside))
@@ -145,11 +147,14 @@ def _axes(source: Source, said: FieldMap, name: str, vector: bool) -> str:
     return space
 
 
-def _check_components(source: Source, names: Sequence[str], sizes: list[dict[str, int]], dimension: int) -> None:
-    first = {letter: size for letter, size in sizes[0].items() if letter != "c"}
+def _check_components(
+    source: Source, names: Sequence[str], sizes: list[dict[str, int]], dimension: int, velocity: dict[str, int]
+) -> None:
+    """Refuse arrays of a vector field that are not as the first one of the velocity, or too many or few."""
+    first = {letter: size for letter, size in velocity.items() if letter != "c"}
     for name, size in zip(names, sizes, strict=True):
         if {letter: count for letter, count in size.items() if letter != "c"} != first:
-            raise FormatError(f"{source.path}: {name} has the shape {size}, but {names[0]} has {sizes[0]}")
+            raise FormatError(f"{source.path}: {name} has the shape {size}, but the velocity has {velocity}")
     count = sizes[0].get("c", 1) * len(names)
     if count != dimension and (dimension, count, len(names)) != (2, 3, 1):  # a plane of vectors in space: its z is left
         raise FormatError(

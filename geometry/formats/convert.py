@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import h5py
 import numpy as np
 
+from geometry.arguments import checked
 from geometry.grids.grid import Grid
 from geometry.recordings.read import read_recording
 from geometry.recordings.recording import Recording, Wall
@@ -18,10 +19,13 @@ from geometry.surfaces.files import holds_surface
 from .assemble import Fields
 from .displacement import MotionOptions
 from .field_map import FieldMap
+from .own_files import own_recording
 from .readers.hdf5 import text
 from .series import read_fields
-from .source import FormatError
+from .source import FormatError, understood
 from .walls import inside_at, wall_by_displacements, wall_from_files, wall_from_mask
+
+ADDED = ("nyquist", "cut", "period")  # what is added to a recording that there is
 
 
 @dataclass(frozen=True)
@@ -70,6 +74,7 @@ class Converted:
     notes: tuple[str, ...] = ()
 
 
+@checked
 def convert(
     inputs: Sequence[str | Path],
     said: FieldMap | None = None,
@@ -108,12 +113,38 @@ def convert(
     text_of = description or f"converted from {paths[0].name}" + (
         f" and {len(paths) - 1} more" if len(paths) > 1 else ""
     )
-    if not format and all(path.is_file() and holds_surface(path) for path in paths):
-        return _walls_alone(paths, said, wall, about, text_of)
-    if len(paths) == 1 and not format and _is_recording(paths[0]):
-        return Converted(read_recording(paths[0]))
-    fields = read_fields(paths, said, format)
-    return _walled(fields, said, wall, about, text_of)
+    with understood(paths[0]):
+        own = _own(paths, said, wall, description) if not format else None
+        if own is not None:
+            return own
+        if not format and all(path.is_file() and holds_surface(path) for path in paths):
+            return _walls_alone(paths, said, wall, about, text_of)
+        return _walled(read_fields(paths, said, format), said, wall, about, text_of)
+
+
+def _own(paths: Sequence[Path], said: FieldMap, wall: WallOptions, description: str) -> Converted | None:
+    """A recording's file, or what `export` made of one, with what may be added to it; None for any other file."""
+    added = {name: getattr(said, name) for name in ADDED if getattr(said, name) != getattr(FieldMap(), name)}
+    plain = replace(said, **{name: getattr(FieldMap(), name) for name in ADDED}) == FieldMap() and wall == WallOptions()
+    is_recording = len(paths) == 1 and _is_recording(paths[0])
+    if is_recording and not plain:
+        raise FormatError(
+            f"{paths[0]}: is a recording already, in SI units; of the options of arrays, units and walls only "
+            "--nyquist, --cut and --period go with it: leave the others out"
+        )
+    if not plain:
+        return None
+    recording = read_recording(paths[0]) if is_recording else own_recording(paths)
+    if recording is None:
+        return None
+    if said.cut and recording.dimension == 3:
+        raise FormatError(f"{paths[0]}: is a volume, and --cut is for planes that are cut out of one; leave it out")
+    if "nyquist" in added:
+        added["nyquist"] = np.full(recording.frames, added["nyquist"])
+    if description:
+        added["description"] = description
+    notes = () if is_recording else (f"{paths[0].name} is an export of a recording, taken as it was",)
+    return Converted(replace(recording, **added) if added else recording, notes)
 
 
 def _is_recording(path: Path) -> bool:

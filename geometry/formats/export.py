@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+from geometry.arguments import checked
 from geometry.recordings.recording import Recording
 from geometry.recordings.whole_file import written_together
 
@@ -29,6 +30,7 @@ EXPORTS: dict[str, tuple[str, Callable[[Path, Recording], list[Path]]]] = {
 """Formats by name: the end of their files' names, and what writes them. A new one is a file and a line here."""
 
 
+@checked
 def export(recording: Recording, path: str | Path, to: str) -> list[Path]:
     """Write a recording in another format.
 

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from geometry.arguments import checked
 from geometry.recordings.units import factor
 
 from .source import FormatError
@@ -100,6 +101,7 @@ class FieldMap:
         return factor(text, quantity) if text else None
 
 
+@checked
 def read_field_map(path: str | Path) -> FieldMap:
     """A field map from a TOML file whose keys are the attributes of `FieldMap`.
 

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from geometry.arguments import checked, shown
 from geometry.grids.grid import Grid
 from geometry.recordings.opening_flux import GROUP, fluxes_of, is_flux
 from geometry.recordings.quality import QUALITY_NAMES, Quality
@@ -42,6 +43,7 @@ ATTRIBUTES = {
 }
 
 
+@checked
 def to_xarray(recording: Recording) -> xarray.Dataset:
     """A dataset with the dimensions time, component, z, y, x and coordinates in s and m."""
     try:
@@ -82,7 +84,10 @@ def from_xarray(dataset: xarray.Dataset) -> Recording:
     Raises:
         FormatError: a variable, coordinate or attribute is missing, or coordinates are not evenly spaced.
         RecordingError: shapes disagree.
+        TypeError: it is no dataset.
     """
+    if not hasattr(dataset, "dims") or not hasattr(dataset, "variables"):
+        raise TypeError(f"from_xarray: dataset must be an xarray Dataset, got {shown(dataset)}")
     dimension = 3 if "z" in dataset.dims else 2
     missing = [name for name in ("velocity", "mask", "time", *SPACE[dimension]) if name not in dataset.variables]
     missing += [name for name in ("rho", "mu") if name not in dataset.attrs]

@@ -85,12 +85,15 @@ def fill_vectors(
     """
     for number, (array, letters, about, unit) in enumerate(arrays):
         for where, values in placed(array, letters, lie):
-            plain = unpacked(values, about) * unit
+            with np.errstate(invalid="ignore", over="ignore"):  # told by the checks of the recording
+                plain = unpacked(values, about) * unit
             first = where[1].start if len(arrays) == 1 else number
             for component in range(first, min(first + values.shape[1], result.shape[1])):
                 for axis in np.flatnonzero(matrix[:, component]).tolist():
                     turned = matrix[axis, component] * plain[:, component - first]
-                    result[where[0], axis][(slice(None), *where[2:])] += np.asarray(turned, np.float32)
+                    with np.errstate(over="ignore"):
+                        narrow = np.asarray(turned, np.float32)
+                    result[where[0], axis][(slice(None), *where[2:])] += narrow
 
 
 def fill_scalar(

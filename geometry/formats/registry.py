@@ -19,7 +19,7 @@ from .readers.piv_text import open_piv
 from .readers.tracks import open_tracks
 from .readers.vtk_image import open_vtk_image, open_vtkhdf
 from .readers.xarray_file import open_xarray
-from .source import FormatError, Source
+from .source import FormatError, Source, understood
 
 
 @dataclass(frozen=True)
@@ -61,16 +61,15 @@ def open_source(path: Path, said: FieldMap, name: str = "") -> Source:
     if not path.exists():
         raise FileNotFoundError(f"{path}: there is no such file")
     known = {one.name: one for one in FORMATS}
-    if name:
-        if name not in known:
-            raise FormatError(f"{path}: there is no format {name!r}; known are {', '.join(known)}")
-        return known[name].open(path, said)
-    for one in FORMATS:
-        if path.name.lower().endswith(one.suffixes):
-            if one.name == "hdf5" and _is_vtkhdf(path):
-                return known["vtkhdf"].open(path, said)
-            return one.open(path, said)
-    raise FormatError(f"{path}: which format is it? Say it (--format {'|'.join(known)})")
+    if name and name not in known:
+        raise FormatError(f"{path}: there is no format {name!r}; known are {', '.join(known)}")
+    with understood(path):
+        fitting = known.get(name) or next((one for one in FORMATS if path.name.lower().endswith(one.suffixes)), None)
+        if fitting is None:
+            raise FormatError(f"{path}: which format is it? Say it (--format {'|'.join(known)})")
+        if not name and fitting.name == "hdf5" and _is_vtkhdf(path):
+            fitting = known["vtkhdf"]
+        return fitting.open(path, said)
 
 
 def _is_vtkhdf(path: Path) -> bool:

@@ -12,7 +12,7 @@ from .assemble import Fields, assemble
 from .axis_order import in_best_order
 from .field_map import FieldMap
 from .registry import open_source
-from .source import FormatError, Source
+from .source import FormatError, Source, understood
 
 
 def read_fields(paths: Sequence[Path], said: FieldMap, format: str) -> Fields:
@@ -26,6 +26,11 @@ def read_fields(paths: Sequence[Path], said: FieldMap, format: str) -> Fields:
     Raises:
         FormatError: a file cannot be understood, or the files do not belong together.
     """
+    with understood(paths[0]):
+        return _read(paths, said, format)
+
+
+def _read(paths: Sequence[Path], said: FieldMap, format: str) -> Fields:
     first = open_source(paths[0], said, format)
     wanted = [name for name in (*said.velocity, said.mask, said.weight, *said.sigma) if name]
     if len(paths) == 1 or all(name in first.arrays for name in wanted):

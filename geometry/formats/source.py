@@ -2,15 +2,47 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
 
+from geometry.recordings.errors import RecordingError
+from geometry.surfaces.surface import SurfaceError
+
 
 class FormatError(ValueError):
     """A file that cannot be converted; the text names it, the rule broken and what to do."""
+
+
+@contextmanager
+def understood(path: object) -> Iterator[None]:
+    """The boundary around the readers of many packages: whatever they raise names the file.
+
+    Raises:
+        FormatError: they stumbled over the file.
+    """
+    try:
+        yield
+    except (FormatError, RecordingError, SurfaceError, MemoryError):
+        raise
+    except OSError as fault:
+        if fault.errno is not None or type(fault) is not OSError:  # h5py's name neither file nor number
+            raise
+        raise _stumbled(path, fault) from fault
+    except Exception as fault:
+        raise _stumbled(path, fault) from fault
+
+
+def _stumbled(path: object, fault: Exception) -> FormatError:
+    said = " ".join(str(fault).split())[:200]
+    kind = type(fault).__name__
+    return FormatError(
+        f"{path}: is damaged, or not what its name or the options say ({kind}{': ' if said else ''}{said}); write or "
+        "copy it again, or name its format (--format)"
+    )
 
 
 class ArrayLike(Protocol):

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from geometry.arguments import ENDLESS, checked, finite
+from geometry.arguments import ENDLESS, POSITIVE, checked, finite
 
 from .integers import region_number
 from .overlap import refuse_overlaps, united
@@ -100,6 +100,7 @@ def holds_surface(path: Path) -> bool:
         return b"POLYDATA" in file.read(1024).upper()
 
 
+@checked(scale=POSITIVE)
 def write_surface(path: str | Path, surface: Surface, *, scale: float = 1.0) -> None:
     """Write a 3-D surface as STL, OBJ or PLY by suffix, in units of `scale` (m); PLY keeps the regions."""
     path = Path(path)

@@ -14,7 +14,7 @@ if str(ROOT) not in sys.path:
 
 from examples.figures.__main__ import draw, main
 from examples.figures.material import Material
-from examples.figures.record import is_current
+from examples.figures.record import alike, is_current
 from examples.figures.registry import FIGURES
 
 RESULTS = ROOT / "examples" / "figures" / "results"
@@ -144,6 +144,26 @@ def test_a_figure_that_is_current_is_not_drawn_again(material, tmp_path, monkeyp
     assert not is_current(tmp_path / "phantom.json", fast=False)
     monkeypatch.setattr("examples.figures.__main__.draw", lambda *_: pytest.fail("drawn again"))
     assert main(["phantom", "--fast", "--out", str(tmp_path)]) == 0
+
+
+def test_later_code_that_gives_the_same_numbers_confirms_a_figure(material, tmp_path):
+    draw(FIGURES["phantom"], material, tmp_path)
+    file = tmp_path / "phantom.json"
+    drawn = json.loads(file.read_text(encoding="utf-8"))
+    older = drawn["from"] | {"code": "another", "commit": "before"}
+    for check, current in ((drawn["numbers"], True), (drawn["numbers"] | {"more": 1.0}, False), (None, False)):
+        file.write_text(json.dumps(drawn | {"fast": False, "check": check, "from": older}), encoding="utf-8")
+        assert main(["phantom", "--confirm", "--out", str(tmp_path)]) == 0
+        assert is_current(file, fast=False) == current
+        found = json.loads(file.read_text(encoding="utf-8"))
+        assert found["numbers"] == drawn["numbers"] and found["from"]["command"] == older["command"]
+        assert found["from"].get("numbers of") == ("before" if current else None)
+
+
+def test_what_counts_as_the_same_numbers():
+    assert alike({"a": [1.0, "x", None, float("nan")]}, {"a": [1.0 + 1e-9, "x", None, float("nan")]})
+    for other in ({"a": [1.001]}, {"a": [1.0, 1.0]}, {"b": [1.0]}, {"a": ["1.0"]}, [1.0]):
+        assert not alike({"a": [1.0]}, other)
 
 
 def test_every_figure_is_there():

@@ -12,6 +12,8 @@ from typing import NoReturn
 
 from torchsph.simulator.schemes.presets import PRESETS
 
+from .terminal import printable
+
 # folder of the results where no other is named
 OUT = "torchsph-out"
 # in the place of a spacing: as fine as the budget allows
@@ -30,7 +32,7 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Leave with code 2 and one line."""
-        self.exit(2, f"{self.prog}: error: {' '.join(message.split())} (see {self.prog} --help)\n")
+        self.exit(2, f"{self.prog}: error: {printable(' '.join(message.split()))} (see {self.prog} --help)\n")
 
 
 def add_model_options(parser: argparse.ArgumentParser) -> None:

@@ -27,7 +27,7 @@ from .lagrangian.tracers import Tracers, carry, residence_time, seed_blood
 from .plane_quantities import CUT_UNITS, PLANE_UNITS, PlaneQuantities
 from .pressure import PressureSolver, pressure_difference, region_mean
 from .quantities import UNITS, Catalogue, FrameQuantities, catalogue, flow_quantities
-from .uncertainty import RunningMoments, Summary, around, coverage, summary
+from .uncertainty import RunningMoments, Summary, around, coverage, summary, unresolved
 from .vortices import PlaneCore, PlaneVortex, VortexRing, main_vortex, plane_cores, vortex_cores, vortex_ring
 from .vorticity import helicity_density, lambda2, q_criterion, swirl, vorticity
 from .wall_shear import WallShear
@@ -100,6 +100,7 @@ __all__ = [
     "summary",
     "swirl",
     "time_derivative",
+    "unresolved",
     "vortex_cores",
     "vortex_ring",
     "vorticity",

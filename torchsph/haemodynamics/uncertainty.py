@@ -7,6 +7,12 @@ An ensemble around a control that is not its mean gives control + (x_m - mean): 
 95 % quantiles of a sample lie too far inside; `summary` therefore takes those of Student's distribution with the
 sample's mean and deviation, which hold the right share for a normal quantity at any number of members (Wilks
 2011): mean +- t(.95, M - 1) s sqrt(1 + 1 / M).
+
+Members agree about what none of them shows: what is finer than the measurement's resolution. Two numbers say how much
+of a quantity lies there, and the larger counts as a deviation that all members share (`unresolved`): what the members'
+variance adds to a quadratic of their mean, a correction that is as uncertain as it is large; and what the measurement's
+kernel takes from the quantity when the estimate is put through it once more (after Roache 1994, who judges a solution
+by what it loses on a coarser grid).
 """
 
 from __future__ import annotations
@@ -18,7 +24,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import stdtrit
 
-__all__ = ["RunningMoments", "Summary", "around", "coverage", "summary"]
+__all__ = ["RunningMoments", "Summary", "around", "coverage", "summary", "unresolved"]
 
 Array = NDArray[np.float64]
 
@@ -34,8 +40,12 @@ class Summary(NamedTuple):
     high: Array
 
 
-def summary(values: ArrayLike) -> Summary:
+def summary(values: ArrayLike, shared: ArrayLike = 0.0) -> Summary:
     """Summary over the first axis of `values` `(M, ...)`; nan where a member has no value.
+
+    Args:
+        values: of each member.
+        shared: `(...)`, a deviation of all members together, beside that among them (`unresolved`).
 
     Raises:
         ValueError: there are fewer than two members.
@@ -44,9 +54,22 @@ def summary(values: ArrayLike) -> Summary:
     count = len(members)
     if count < 2:
         raise ValueError(f"summary: a spread needs at least 2 members, not {count}")
-    mean, deviation = members.mean(0), members.std(0, ddof=1)
+    mean, deviation = members.mean(0), np.hypot(members.std(0, ddof=1), np.asarray(shared, np.float64))
     reach = stdtrit(count - 1, BAND[1]) * np.sqrt(1 + 1 / count) * deviation
     return Summary(mean, deviation, mean - reach, mean + reach)
+
+
+def unresolved(estimate: ArrayLike, members: ArrayLike, coarser: ArrayLike | None = None) -> Array:
+    """How much of a quantity lies at scales that estimate and members lack, `(...)`, in its own unit.
+
+    Args:
+        estimate: the quantity of the estimate, `(...)`.
+        members: of each member around it, `(M, ...)`.
+        coarser: of the estimate put through the measurement's kernel once more, `(...)`; None where none is known.
+    """
+    alone = np.asarray(estimate, np.float64)
+    added = np.abs(np.asarray(members, np.float64).mean(0) - alone)
+    return added if coarser is None else np.maximum(added, np.abs(alone - np.asarray(coarser, np.float64)))
 
 
 def around(control: ArrayLike, members: ArrayLike, scale: ArrayLike = 1.0) -> Array:

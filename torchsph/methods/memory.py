@@ -21,6 +21,7 @@ from regularize.smoothing.samples import FitData
 from regularize.solvers.memory import band_bytes
 from torchsph.pairs.smoothing_kernels import kernel
 from torchsph.simulator.schemes.scheme import Scheme
+from torchsph.simulator.walls.fields import TABLES_KEPT, TABLES_MEMORY
 
 from .measurement.frame_splines import FrameSmoother
 from .runtime.control_groups import OWN, ROOT, control_groups
@@ -30,12 +31,13 @@ _PER_SAMPLE = 10_000  # bytes of rows and of errors that neighbours share
 # beyond this these rows are in blocks so large (32 MB, glibc's M_MMAP_THRESHOLD) that freeing gives them back
 _ROWS_KEPT = 64 << 20
 _PER_PARTICLE = {2: 1_000, 3: 3_000}  # bytes of state, neighbours and sums
-_TABLES_KEPT, _TABLE_MEMORY = 24, 1 << 29  # as `simulator.walls.fields` keeps them
-_SETS_OF_OPENINGS = 2  # tables for each key time: valves open and close in between
+_SETS_OF_OPENINGS = 2  # tables for each key time where there are valves, which open and close in between
 _TABLES_IN_MAKING = 3  # what transforms and distances take while one is made
 _PROGRAM = 250 << 20  # a worker with all that it has imported, before its work
 _LIBRARIES = 36 << 20  # what is loaded at the first fit and the first step
 _COPIES_OF_RECORDING, _COPIES_OF_MEMBERS = 10, 6
+# the analysis gathers each number of the state for the patches that share it, in parts of 32 MB, three at a time
+_GATHERED, _PARTS = 32 << 20, 3
 
 
 class NotEnoughMemory(MemoryError):
@@ -131,18 +133,21 @@ def predicted(
         further: more measurements of the beat.
     """
     dimension, field = recording.dimension, 4 * recording.dimension * recording.grid.size
-    volume = float(recording.mask.reshape(recording.frames, -1).sum(1).max()) * float(np.prod(recording.grid.spacing))
+    most = int(recording.mask.reshape(recording.frames, -1).sum(1).max())
+    volume = most * float(np.prod(recording.grid.spacing))
     runs = list(spacings)
     particles = sum(int(count * volume / spacing**dimension) for spacing, count in runs) * _PER_PARTICLE[dimension]
     arrays = sum(value.nbytes for one in (recording, *further) for value in one.arrays().values())
+    gathered = 4 * dimension * 2**dimension * most * members
     bands, rows = (0, 0) if splines is None else _splines(splines)
     return MemoryPrediction(
         splines=bands + rows,
         particles=particles,
         tables=sum(_tables(recording, scheme, spacing) for spacing in dict(runs)),
-        members=_COPIES_OF_MEMBERS * members * field,
+        members=_COPIES_OF_MEMBERS * members * field + _PARTS * min(_GATHERED, gathered),
         recordings=arrays + copies * recording.frames * field,
-        released=max(0, rows - _ROWS_KEPT),
+        # an ensemble fits again while its members live; else splines are done before particles are made
+        released=max(0, rows - _ROWS_KEPT) if members else bands + rows,
     )
 
 
@@ -171,7 +176,8 @@ def _tables(recording: geometry.Recording, scheme: Scheme, spacing: float) -> in
         channels += 1 + recording.dimension + int(scheme.wall.sliding)
     each = 4 * channels * nodes
     moving = recording.frames if recording.wall_for("the simulator").moves else 1
-    kept = min(_SETS_OF_OPENINGS * moving, max(_TABLES_KEPT, _TABLE_MEMORY // each))
+    sets = 1 if recording.valve_intervals is None and recording.valve_open is None else _SETS_OF_OPENINGS
+    kept = min(sets * moving, max(TABLES_KEPT, TABLES_MEMORY // each))
     return int(each * (kept + _TABLES_IN_MAKING))
 
 

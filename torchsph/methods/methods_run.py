@@ -22,6 +22,7 @@ from .members.draws import spline_frames
 from .members.frames import FrameObserver
 from .members.kept import MemberFile
 from .members.quantities import MemberCurves, MemberQuantities, quantified, with_pressure
+from .members.resolution import Resolution
 from .models import Models
 from .nudging import filter_sph
 from .runtime.checkpoint import Saved
@@ -176,7 +177,10 @@ class MethodsRun:
         """What draws from the splines' posterior give."""
         prepared, count, seed = self.prepared, self.members, self.seed
         amplitude = Amplitude(prepared.balance, prepared.amplitude_error, count, seed)
-        frames = spline_frames(prepared.splines, prepared.smoothed, count, seed=seed, amplitude=amplitude)
+        resolution = Resolution.of(prepared.recording, prepared.balance, prepared.error.kernel)
+        frames = spline_frames(
+            prepared.splines, prepared.smoothed, count, seed=seed, amplitude=amplitude, resolution=resolution
+        )
         return quantified(prepared.smoothed, frames)
 
 

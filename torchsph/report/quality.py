@@ -101,7 +101,7 @@ def _noise(measured: geometry.Recording, analysis: geometry.Recording, left: np.
         sigma = measured.sigma[np.broadcast_to(measured_nodes(measured)[:, None], measured.sigma.shape)]
         stated = float(np.median(sigma)) if sigma.size else float("nan")
         text += f"; stated {stated:.3g} m/s (median)"
-        if not 0.5 <= level / stated <= 2:
+        if not 0.5 * stated <= level <= 2 * stated:  # a file may state 0
             verdict = POOR if level > 2 * stated else FAIR
     return Check("Noise", verdict, f"{text}; usual speed of the analysis {speed:.3g} m/s per component", means)
 

@@ -41,11 +41,11 @@ from torchsph.haemodynamics import (
     coverage,
     flow_components,
     seed_blood,
-    summary,
     time_derivative,
 )
 from torchsph.haemodynamics.flow_rate import peaks
 from torchsph.methods.members.kept import read_members
+from torchsph.methods.members.quantities import MemberQuantities
 
 SOURCES = ("examples/benchmarks/haemodynamics/quantities.py", "torchsph/haemodynamics", *ANALYSES)
 
@@ -141,20 +141,17 @@ class Members(NamedTuple):
 
 def kept_members(run: Path, analysis: geometry.Recording, frames: list[FrameQuantities]) -> Members:
     """Read out of the members themselves."""
-    curves, pressures = [], []
+    read, pressures = MemberQuantities(analysis), []
     for frame in read_members(run / "members.h5", analysis):
+        read.take(frame)
         velocity = np.concatenate([frame.field[None], frame.members])
         made = frames[frame.frame].of(velocity, np.concatenate([frame.rate[None], frame.member_rates]))
-        curves.append({name: made.curves[name][1:] for name in UNITS})
         own = made.pressure[0]
         if frame.pressure is not None:
             own = np.where(np.isfinite(frame.pressure), frame.pressure, own)
         pressures.append((made.pressure[0], made.pressure[1:].mean(0), own))
     fields = zip(("forecast rates", "members", "simulator"), zip(*pressures, strict=True), strict=True)
-    stacked = {name: np.stack([one[name] for one in curves], axis=1) for name in UNITS}
-    return Members(
-        {name: summary(values) for name, values in stacked.items()}, {name: np.stack(parts) for name, parts in fields}
-    )
+    return Members(read.found().bands(), {name: np.stack(parts) for name, parts in fields})
 
 
 def noted_members(run: Path, analysis: geometry.Recording, own: np.ndarray) -> Members:

@@ -120,7 +120,7 @@ def open_nrrd(path: Path) -> Source:
         raise FormatError(f"{path}: is no readable NRRD file ({fault})") from fault
     image = _image(path, header, start)
     axes = _axes(header, len(image.shape), path)
-    name = path.name.partition(".")[0]
+    name = stem(path)
     world = SPACES.get(str(header.get("space", "")).lower(), "")
     if header.get("space") and not world and not str(header["space"]).endswith("dimensional"):
         world = _space(str(header["space"]), path)
@@ -137,6 +137,11 @@ def open_nrrd(path: Path) -> Source:
         roles={"velocity": (name,)} if "c" in axes and image.shape[axes.index("c")] == 3 else {},
         close=image.close,
     )
+
+
+def stem(path: Path) -> str:
+    """The file's name without the format's own ends."""
+    return path.name.removesuffix(".nrrd").removesuffix(".nhdr").removesuffix(".seq")
 
 
 def _space(name: str, path: Path) -> str:

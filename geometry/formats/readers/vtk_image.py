@@ -9,6 +9,7 @@ import h5py
 import numpy as np
 
 from geometry.formats.source import FormatError, Source, diagonal, missing_extra
+from geometry.surfaces.readers.quiet_vtk import quiet_vtk
 
 from .hdf5 import datasets, text
 from .streamed import Streamed
@@ -34,7 +35,8 @@ class Slabs:
         selection.DisableAllArrays()
         selection.EnableArray(self._name)
         extent = (low[0], low[0] + nx - 1, low[1], low[1] + ny - 1, low[2] + begin, low[2] + end - 1)
-        self._reader.UpdateExtent(extent)
+        with quiet_vtk():
+            self._reader.UpdateExtent(extent)
         values = vtk_to_numpy(self._reader.GetOutput().GetPointData().GetArray(self._name))
         values = values.reshape(end - begin, *self.shape[1:])
         return values.copy() if index == (...,) else values[(slice(None), *index[1:])].copy()
@@ -71,7 +73,8 @@ def _open_vti(path: Path) -> Source:
     except ImportError as fault:
         raise missing_extra(path, "vtk") from fault
     reader, faults = _watched(vtkXMLImageDataReader(), path)
-    reader.UpdateInformation()
+    with quiet_vtk():
+        reader.UpdateInformation()
     about = reader.GetOutputInformation(0)
     extent = about.Get(vtkStreamingDemandDrivenPipeline.WHOLE_EXTENT())
     listed = about.Get(vtkDataObject.POINT_DATA_VECTOR())
@@ -85,7 +88,8 @@ def _open_vti(path: Path) -> Source:
         name = one.Get(vtkDataObject.FIELD_NAME())
         arrays[name] = Slabs(reader, name, (nz, ny, nx, *((count,) if count > 1 else ())), tuple(extent[::2]))
     reader.GetPointDataArraySelection().DisableAllArrays()
-    reader.UpdateExtent((extent[0], extent[0], extent[2], extent[2], extent[4], extent[4]))
+    with quiet_vtk():
+        reader.UpdateExtent((extent[0], extent[0], extent[2], extent[2], extent[4], extent[4]))
     return _image_source(path, arrays, *_place_and_time(reader.GetOutput(), tuple(extent[::2])))
 
 
@@ -97,7 +101,8 @@ def _open_whole(path: Path) -> Source:
     except ImportError as fault:
         raise missing_extra(path, "vtk") from fault
     reader, faults = _watched(vtkStructuredPointsReader(), path)
-    reader.Update()
+    with quiet_vtk():
+        reader.Update()
     image = reader.GetOutput()
     if faults or image is None or image.GetNumberOfPoints() == 0:
         raise FormatError(f"{path}: vtk finds no image data in it (VTI or legacy structured points)")

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from geometry.formats.own_mark import MARK, marked
 from geometry.formats.source import FormatError
 from geometry.recordings.recording import Recording
 
@@ -43,6 +44,7 @@ def write_matlab(path: Path, recording: Recording) -> list[Path]:
             "region": wall.region,
             "velocity": np.moveaxis(wall_velocity(wall, recording.time), 0, -1),
         }
+    content[MARK] = marked(recording)
     largest = max((value.nbytes for value in content.values() if isinstance(value, np.ndarray)), default=0)
     if largest > LARGEST:
         raise FormatError(

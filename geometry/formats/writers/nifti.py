@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from geometry.formats.own_mark import MARK, marked
 from geometry.formats.source import missing_extra
 from geometry.recordings.recording import Recording
 
@@ -42,6 +43,9 @@ def write_nifti(path: Path, recording: Recording) -> list[Path]:
         image.header["toffset"] = float(recording.time[0])
         if name in VECTORS:
             image.header.set_intent("vector", name="velocity m/s" if name == "velocity" else name)
+        if name == "velocity":
+            note = f"{MARK} {marked(recording)}".encode()
+            image.header.extensions.append(nibabel.nifti1.Nifti1Extension("comment", note))
         target = path.with_name(f"{stem}{'' if name == 'velocity' else '_' + name}.nii.gz")
         nibabel.save(image, target)
         written.append(target)

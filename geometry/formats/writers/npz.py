@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from geometry.formats.own_mark import FIELDS, MARK, marked
 from geometry.recordings.recording import Recording
 
 
@@ -15,5 +16,6 @@ def write_npz(path: Path, recording: Recording) -> list[Path]:
     content: dict[str, Any] = {name.strip("/").replace("/", "_"): values for name, values in recording.arrays().items()}
     content |= {name: np.float64(getattr(recording, name)) for name in ("rho", "mu", "period")}
     content |= {"origin": np.array(recording.grid.origin), "spacing": np.array(recording.grid.spacing)}
+    content[MARK] = np.array(marked(recording, [name for name in FIELDS if name != "beam"]))
     np.savez_compressed(path, **content)
     return [path]

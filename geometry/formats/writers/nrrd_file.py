@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from geometry.formats.own_mark import MARK, marked
 from geometry.formats.source import missing_extra
 from geometry.recordings.recording import Recording
 
@@ -41,6 +42,8 @@ def write_nrrd(path: Path, recording: Recording) -> list[Path]:
             "axis 0 index values": " ".join(repr(float(time)) for time in recording.time),
             "units of values": UNITS[name],
         }
+        if name == "velocity":
+            header[MARK] = marked(recording)
         target = path.with_name(f"{stem}{'' if name == 'velocity' else '_' + name}.seq.nrrd")
         nrrd.write(str(target), np.ascontiguousarray(values), header, index_order="F")
         written.append(target)

@@ -10,6 +10,8 @@ from pathlib import Path
 import h5py
 import numpy as np
 
+from geometry.arguments import checked
+from geometry.formats.own_mark import SOURCE
 from geometry.recordings.read import read_recording
 from geometry.recordings.recording import Recording, Wall
 
@@ -17,6 +19,7 @@ from .common import SCALARS, VECTORS, wall_velocity
 from .vtkhdf import TOPOLOGIES, image_data, in_memory, time_steps
 
 
+@checked
 def write_sidecar(recording_file: str | Path, recording: Recording | None = None) -> list[Path]:
     """VTKHDF files beside a recording's file, tens of kB, that viewers open in its place.
 
@@ -41,6 +44,7 @@ def write_sidecar(recording_file: str | Path, recording: Recording | None = None
             if node is not None:
                 _virtual(points, name, node, recording, source.name)
         time_steps(file["VTKHDF"], recording.time, list(points))
+        file.attrs[SOURCE] = source.name
     if recording.wall is None:
         return [path]
     beside = path.with_name(f"{path.stem}_wall.vtkhdf")

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from geometry.formats.own_mark import MARK, marked
 from geometry.formats.source import missing_extra
 from geometry.recordings.recording import Recording
 
@@ -46,7 +47,8 @@ def write_vti(path: Path, recording: Recording) -> list[Path]:
         image.GetFieldData().AddArray(stamp)
         names.append(path.with_name(f"{path.stem}_{frame:04d}.vti"))
         _write(vtkXMLImageDataWriter(), image, names[-1])
-    written = [_series(path.with_name(f"{path.stem}.vti.series"), names, recording.time), *names]
+    series = path.with_name(f"{path.stem}.vti.series")
+    written = [_series(series, names, recording.time, {MARK: marked(recording)}), *names]
     return written + (_walls(path, recording) if recording.wall is not None else [])
 
 
@@ -86,7 +88,7 @@ def _write(writer: vtkXMLWriter, data: vtkDataObject, path: Path) -> None:
         raise OSError(f"{path}: vtk could not write it")
 
 
-def _series(path: Path, names: list[Path], time: np.ndarray) -> Path:
+def _series(path: Path, names: list[Path], time: np.ndarray, more: dict[str, str] | None = None) -> Path:
     files = [{"name": name.name, "time": float(at)} for name, at in zip(names, time, strict=True)]
-    path.write_text(json.dumps({"file-series-version": "1.0", "files": files}))
+    path.write_text(json.dumps({"file-series-version": "1.0", "files": files} | (more or {})))
     return path

@@ -14,6 +14,7 @@ from types import TracebackType
 import h5py
 import numpy as np
 
+from geometry.formats.own_mark import MARK, marked
 from geometry.recordings.recording import Recording
 from geometry.recordings.whole_file import write_whole
 
@@ -35,6 +36,7 @@ def write_vtkhdf(path: Path, recording: Recording) -> list[Path]:
             if values is not None:
                 _store(points, name, values, recording.dimension)
         time_steps(file["VTKHDF"], recording.time, list(points))
+        file[MARK] = marked(recording)  # beside what viewers look at
     return [path, *_wall(path, recording)]
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from .polygons import PolygonError, Polygons
+from .quiet_vtk import quiet_vtk
 
 LABELS = ("region", "label", "RegionId", "CellEntityIds", "ModelFaceID")
 
@@ -28,12 +29,13 @@ def read_vtk_polygons(path: Path) -> Polygons:
     reader.SetFileName(str(path))
     faults: list[str] = []
     reader.AddObserver("ErrorEvent", lambda *_: faults.append("vtk cannot read it"))
-    reader.Update()
     cut = vtkTriangleFilter()
-    cut.SetInputData(reader.GetOutput())
-    cut.PassLinesOff()
-    cut.PassVertsOff()
-    cut.Update()
+    with quiet_vtk():
+        reader.Update()
+        cut.SetInputData(reader.GetOutput())
+        cut.PassLinesOff()
+        cut.PassVertsOff()
+        cut.Update()
     mesh = cut.GetOutput()
     if faults or mesh.GetNumberOfPolys() == 0:
         raise PolygonError(faults[0] if faults else "holds no triangles")

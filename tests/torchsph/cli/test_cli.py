@@ -339,6 +339,7 @@ FAULTS = {
     "output missing": (["smooth", "{measured}"], "--out"),
     "nothing to look at": (["info"], "FILE"),
     "no value at all": (["assimilate", "{measured}", "--spacing=--"], "--spacing: '--' is no value"),
+    "an escape": (["measure", "{truth}", "--out", "m.h5", "--every=\x1b[2J"], r"'\x1b[2J' is not a whole number"),
     "more alive than there are": (
         ["assimilate", "{measured}", "--members", "3", "--minimum-members", "4"],
         "only 3 members",

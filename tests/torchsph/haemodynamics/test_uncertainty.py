@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from torchsph.haemodynamics.uncertainty import RunningMoments, around, coverage, summary
+from torchsph.haemodynamics.uncertainty import RunningMoments, around, coverage, summary, unresolved
 
 
 @pytest.mark.parametrize("members", [4, 16, 64])
@@ -21,6 +21,27 @@ def test_mean_and_deviation():
     assert (found.low < found.mean).all() and (found.high > found.mean).all()
     with pytest.raises(ValueError, match="at least 2"):
         summary(values[:1])
+
+
+def test_what_members_lack_together_widens_the_band():
+    values = np.array([[1.0, 2.0], [3.0, 6.0], [5.0, 4.0]])
+    wide = summary(values, [0.0, 1.5])
+    assert wide.deviation.tolist() == [2.0, 2.5] and wide.mean.tolist() == [3.0, 4.0]
+    np.testing.assert_allclose(
+        (wide.high - wide.mean) / summary(values).deviation, (summary(values).high - 3.0)[0] / 2 * np.array([1.0, 1.25])
+    )
+    # the larger of what the variance adds to the estimate's and of what a second pass takes
+    assert unresolved([2.0, 3.5], values).tolist() == [1.0, 0.5]
+    assert unresolved([2.0, 3.5], values, [1.5, 1.0]).tolist() == [1.0, 2.5]
+
+
+def test_a_band_holds_nine_of_ten_of_what_all_members_miss():
+    """An error that all members share, of a size that is known: without it the band holds far too few."""
+    draws = np.random.default_rng(3)
+    true, *members = draws.normal(size=(17, 20000))
+    members = np.stack(members) + 2.0 * draws.normal(size=20000)
+    assert coverage(summary(members), true) < 0.65
+    assert coverage(summary(members, 2.0), true) == pytest.approx(0.9, abs=0.03)
 
 
 def test_members_around_a_control():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -71,6 +72,10 @@ def test_every_setting_counts_as_it_should(measured):
 
     alone, plain = of(("spline",)), of(spacing=2e-3)
     assert alone.particles == alone.tables == alone.members == 0 and alone.splines == plain.splines > 0
+    free = of(("free",), spacing=2e-3)  # its splines are done before its particles are made: the larger of both
+    assert free.total - alone.total == max(0, free.particles + free.tables - free.splines)
+    valves = replace(measured, valve_intervals=np.array([[1.0, 0.0, 0.004]]))
+    assert by_name.predicted_memory(PreparedMeasurement(valves), ("free",), spacing=2e-3).tables > free.tables
     assert of(spacing=2e-3, members=32).members == 2 * plain.members
     assert of(spacing=1e-3).particles == pytest.approx(8 * plain.particles, rel=1e-3)  # counts of whole particles
     assert of(spacing=1e-3).tables > 2 * plain.tables

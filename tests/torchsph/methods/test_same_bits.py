@@ -7,6 +7,7 @@ import sys
 from contextlib import contextmanager
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 import torch
@@ -92,3 +93,40 @@ def test_splines_have_the_same_bits_whatever_threads_a_process_starts_with(tmp_p
         call = [sys.executable, "-W", "ignore", "-c", FIT]
         found.add(subprocess.run(call, cwd=tmp_path, env=environment, check=True, capture_output=True).stdout)
     assert len(found) == 1
+
+
+def numbers_in(path):
+    """Every array of an HDF5 file."""
+    with h5py.File(path) as file:
+        names: list[str] = []
+        file.visit(names.append)
+        return {name: file[name][()] for name in names if isinstance(file[name], h5py.Dataset)}
+
+
+@pytest.mark.slow
+def test_every_method_has_the_same_bits_whatever_threads_and_workers_a_process_starts_with(tmp_path):
+    """The command line on two frames, with 1, 2 and 3 threads and workers, twice beside a busy process; minutes.
+
+    Both copies of OpenBLAS, numpy's and SciPy's, read the number of threads when they are loaded.
+    """
+    geometry.write_recording(tmp_path / "m.h5", frames(9, 11))
+    root, found = str(Path(regularize.__file__).parents[1]), {}
+    settings = [(threads, 1) for threads in (1, 2, 3)] + [(1, 2), (1, 3), (2, 2)]
+    for turn, (threads, workers) in enumerate(2 * settings):
+        number = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), str(threads))
+        options = f"--method ensemble --members 4 --spacing 4e-3 --seed 1 --keep-members --no-page --workers {workers}"
+        call = [sys.executable, "-W", "ignore", "-m", "torchsph", "assimilate", "m.h5", "--out", f"r{turn}"]
+        with busy_process():
+            environment = {**os.environ, **number, "PYTHONPATH": root}
+            subprocess.run([*call, *options.split()], cwd=tmp_path, env=environment, check=True, capture_output=True)
+        found[turn, threads, workers] = {
+            f"{path.name} {name}": values
+            for path in sorted((tmp_path / f"r{turn}").glob("*.h5"))
+            for name, values in numbers_in(path).items()
+        }
+    first, *others = found.values()
+    assert any(name.startswith("members.h5") for name in first)
+    for other in others:
+        assert other.keys() == first.keys()
+        for name, values in first.items():
+            np.testing.assert_array_equal(values, other[name], str(name))

@@ -100,7 +100,7 @@ def test_the_noise_that_is_found_stands_beside_the_stated_one(box_recording):
     assert verdict == "good" and "the file states none" in found
     values = [float(part.split()[1]) for part in found.split(" m/s")[0].removeprefix("found ").split(", ")]
     np.testing.assert_allclose(values, 0.02, rtol=0.1)
-    for stated, expected in ((0.02, "good"), (0.005, "poor"), (0.08, "fair")):
+    for stated, expected in ((0.02, "good"), (0.005, "poor"), (0.0, "poor"), (0.08, "fair")):
         told = replace(measured, sigma=np.full_like(flow.velocity, stated))
         assert verdicts(told, flow)["Noise"][0] == expected
 

@@ -170,6 +170,8 @@ def test_changes_that_cannot_be():
         run.change(gamma=None)
     with pytest.raises(ValueError, match="'xsph' needs a scheme with XSPH"):
         run.change(xsph=0.1)
+    with pytest.raises(TypeError, match="'viscosity' must be a number, or one for each member, got b'1'"):
+        run.change(viscosity=b"1")
     with pytest.raises(ValueError, match="only shifting, courant, viscosity, valve_strength can change"):
         Simulator(scene, Projection()).start(0.0).change(sound_speed=1.0)
     with pytest.raises(ValueError, match="GammaRamp needs positive start and duration"):

@@ -8,11 +8,12 @@ import geometry
 from torchsph.evaluation import figures, metrics
 from torchsph.methods.by_name import predicted_memory
 from torchsph.methods.measurement.frame_splines import smooth_frames
+from torchsph.methods.measurement.over_time import average_over_time
 from torchsph.methods.measurement.prepared import PreparedMeasurement
 from torchsph.methods.memory import free_memory
 from torchsph.methods.runtime.workers import chosen_workers
 
-from ..arguments import add_sidecar, add_workers
+from ..arguments import AUTO, add_sidecar, add_workers, number
 from ..checks import full_vectors, informative, output_file
 from ..command import Command
 from ..outputs import write_analysis
@@ -24,8 +25,19 @@ from ..running.provenance import provenance
 def _arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("measurement", metavar="MEASUREMENT.h5")
     parser.add_argument("--out", required=True, metavar="SMOOTH.h5", help="the smoothed recording")
+    parser.add_argument(
+        "--over-time",
+        type=_width,
+        metavar="SECONDS",
+        help="average neighbouring frames by a Gaussian of this deviation, or auto: as wide as the frames tell",
+    )
     add_workers(parser)
     add_sidecar(parser)
+
+
+def _width(text: str) -> float | str:
+    """A number of seconds, or the word for as the data tell."""
+    return AUTO if text == AUTO else number(0)(text)
 
 
 def smooth(args: argparse.Namespace) -> None:
@@ -40,6 +52,10 @@ def smooth(args: argparse.Namespace) -> None:
     )
     foretold.in_processes(workers).refuse_beyond(free)
     smoothed = smooth_frames(prepared.splines, shows_bar(args), workers)
+    if args.over_time is not None:
+        asked = None if args.over_time == AUTO else args.over_time
+        smoothed, width = average_over_time(smoothed, prepared.splines, asked, prepared.balance)
+        say(f"averaged over time by a Gaussian of {1e3 * width:.3g} ms")
     account = provenance(args, {"measurement": args.measurement}) | {"processes": workers}
     write_analysis(path, smoothed, account, sidecar=not args.no_sidecar)
     scores = {name: metrics.evaluate(one, None, measured) for name, one in (("raw", measured), ("spline", smoothed))}

@@ -19,6 +19,7 @@ from ..measurement.observation_batch import Part, gathered
 from ..measurement.observation_operator import Measurement
 from ..members.amplitude import Amplitude
 from ..members.frames import FrameObserver, MemberFrames
+from ..members.resolution import Resolution
 from ..runtime.parallel import forked, from_last, is_last, shared
 from .analyser import Analyser
 from .analyses import Analyses
@@ -76,7 +77,8 @@ class Cycle:
         self.member_frames = None
         if observers:
             amplitude = Amplitude(prepared.balance, prepared.amplitude_error, members, seed)
-            self.member_frames = MemberFrames(self.measured, observers, amplitude)
+            resolution = Resolution.of(self.measured, prepared.balance, measurements[0].kernel)
+            self.member_frames = MemberFrames(self.measured, observers, amplitude, resolution)
         self._ensemble: Ensemble | None = None
         self.alive = members
 

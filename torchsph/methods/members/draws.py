@@ -21,6 +21,7 @@ from torchsph.haemodynamics.fields.acceleration import time_derivative
 from ..measurement.frame_splines import FrameSmoother
 from .amplitude import Amplitude
 from .frames import MemberFrame
+from .resolution import Resolution
 
 __all__ = ["spline_frames"]
 
@@ -34,6 +35,7 @@ def spline_frames(
     *,
     seed: int = 0,
     amplitude: Amplitude | None = None,
+    resolution: Resolution | None = None,
 ) -> Iterator[MemberFrame]:
     """The splines of a recording with members drawn around them; a few frames are held at a time.
 
@@ -43,6 +45,7 @@ def spline_frames(
         members: N, at least 2.
         seed: of the draws; those of a frame do not depend on which frames came before.
         amplitude: what members are off by as a whole; None: nothing.
+        resolution: what shows an estimate once more; None: no kernel is known.
 
     Raises:
         ValueError: fewer than two members.
@@ -66,7 +69,17 @@ def spline_frames(
         fields, mask, time = np.stack(held), np.asarray(smoothed.mask[span], bool), smoothed.time[span]
         rate = time_derivative(fields, mask, time, frame - first, order=_ORDER, events=events)
         here = held[frame - first]
-        yield MemberFrame(frame, here[0], here[1:], rate[0], rate[1:], None)
+        again = _once_more(resolution, here[0], rate[0], frame)
+        yield MemberFrame(frame, here[0], here[1:], rate[0], rate[1:], None, *again)
+
+
+def _once_more(
+    resolution: Resolution | None, field: NDArray[np.float32], rate: NDArray[np.floating], frame: int
+) -> tuple[NDArray[np.floating], NDArray[np.floating]] | tuple[None, None]:
+    """A field and its rate as the measurement's kernel shows them once more."""
+    if resolution is None:
+        return None, None
+    return resolution.of_field(torch.from_numpy(field), frame).numpy(), resolution.of_rate(rate, frame)
 
 
 def _drawn(

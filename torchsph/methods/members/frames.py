@@ -24,6 +24,7 @@ import geometry
 
 from ..runtime.parallel import is_lead
 from .amplitude import Amplitude
+from .resolution import Resolution
 
 __all__ = ["FrameObserver", "MemberFrame", "MemberFrames", "at_frame"]
 
@@ -42,6 +43,9 @@ class MemberFrame:
         member_rates: (N, D, *shape), m/s^2, of the members.
         pressure: (*shape), Pa, the simulator's own, of mean 0 over the mask; NaN where no particle came by; None where
             nobody has asked for it.
+        coarser: (D, *shape), m/s, the estimate as the measurement's kernel would show it once more (``Resolution``);
+            None where no kernel is known.
+        coarser_rate: (D, *shape), m/s^2, its du/dt, or None.
     """
 
     frame: int
@@ -50,6 +54,8 @@ class MemberFrame:
     rate: Array
     member_rates: Array
     pressure: Array | None
+    coarser: Array | None = None
+    coarser_rate: Array | None = None
 
 
 class FrameObserver(Protocol):
@@ -72,12 +78,18 @@ class MemberFrames:
         recording: the measurement, whose masks, times and valves are those of the analyses.
         observers: what is done with each frame, in this order.
         amplitude: what members are off by as a whole; None: nothing.
+        resolution: what shows an estimate once more; None: no kernel is known.
     """
 
     def __init__(
-        self, recording: geometry.Recording, observers: Sequence[FrameObserver], amplitude: Amplitude | None = None
+        self,
+        recording: geometry.Recording,
+        observers: Sequence[FrameObserver],
+        amplitude: Amplitude | None = None,
+        resolution: Resolution | None = None,
     ) -> None:
-        self.recording, self.observers, self.amplitude = recording, list(observers), amplitude
+        self.recording, self.observers = recording, list(observers)
+        self.amplitude, self.resolution = amplitude, resolution
         times = np.unique(recording.valve_intervals_or_derived()[:, 1:])
         self._events = times[np.isfinite(times)]
         self._before: dict[str, Tensor] | None = None
@@ -98,6 +110,8 @@ class MemberFrames:
             around = around + self.amplitude.of_fields(field, frame)
         around = torch.where(mask, around, 0.0).to(torch.float32)
         self._frame, self._pending = frame, {"field": field, "members": around}
+        if self.resolution is not None:
+            self._pending["coarser"] = self.resolution.of_field(field, frame)
 
     def forecast(self, rate: Tensor, member_rates: Tensor, failed: Tensor, pressure: Tensor) -> None:
         """The forecast from the last frame analysed, which can be handed on now.
@@ -153,13 +167,16 @@ class MemberFrames:
             nothing = torch.full(size, torch.nan)
             sides = [nothing if side is None else side[name] for side in (before, after)]
             both[name] = at_frame(sides[0], sides[1], weights).numpy()
+        rate = np.nan_to_num(both["rate"])
         made = MemberFrame(
             frame,
             pending["field"].numpy(),
             pending["members"].numpy(),
-            np.nan_to_num(both["rate"]),
+            rate,
             np.nan_to_num(both["member_rates"]),
             without_mean(both["pressure"], np.asarray(self.recording.mask[frame], bool)),
+            None if self.resolution is None else pending["coarser"].numpy(),
+            None if self.resolution is None else self.resolution.of_rate(rate, frame),
         )
         for observer in self.observers if is_lead() else ():
             observer.take(made)

@@ -10,8 +10,10 @@ further loss: the bits that carry nothing would take most of the file. What it m
 | `/members` | (T, N, D, *shape) | m/s |
 | `/rate`, `/member_rates` | (T, D, *shape), (T, N, D, *shape) | m/s^2 |
 | `/pressure` | (T, *shape) | Pa |
+| `/coarser`, `/coarser_rate` | (T, D, *shape) | m/s, m/s^2 |
 
-The attribute `frames_done` says how many frames are there. The estimate itself is the analysis's `/velocity`.
+The attribute `frames_done` says how many frames are there. The estimate itself is the analysis's `/velocity`;
+`/coarser` is that as the measurement's kernel would show it once more, where a kernel is known.
 """
 
 from __future__ import annotations
@@ -38,7 +40,7 @@ _FORMAT = "members"
 def most_bytes(recording: geometry.Recording, members: int) -> int:
     """What a file of the members of a recording takes at most: every number inside the mask, uncompressed."""
     inside = int(np.asarray(recording.mask, bool).sum())
-    return 4 * inside * (2 * members * recording.dimension + recording.dimension + 1)
+    return 4 * inside * (2 * members * recording.dimension + 3 * recording.dimension + 1)
 
 
 def rounded(values: NDArray[np.floating], bits: int = _KEPT_BITS) -> NDArray[np.float32]:
@@ -81,6 +83,9 @@ class MemberFile:
             file["member_rates"][frame.frame] = rounded(frame.member_rates)
             if frame.pressure is not None:
                 file["pressure"][frame.frame] = rounded(frame.pressure)
+            if frame.coarser is not None and frame.coarser_rate is not None:
+                file["coarser"][frame.frame] = rounded(frame.coarser)
+                file["coarser_rate"][frame.frame] = rounded(frame.coarser_rate)
             file.attrs["frames_done"] = frame.frame + 1
 
     def state(self) -> dict[str, Any]:
@@ -104,6 +109,8 @@ class MemberFile:
             "member_rates": (len(frame.members), *shape),
             "pressure": shape[1:],
         }
+        if frame.coarser is not None:
+            sizes |= {"coarser": shape, "coarser_rate": shape}
         for name, size in sizes.items():
             chunk = (1, 1, *shape) if len(size) > len(shape) else (1, *size)
             file.create_dataset(
@@ -135,6 +142,7 @@ def read_members(path: str | Path, analysis: geometry.Recording) -> Iterator[Mem
         _check(file, source, analysis)
         for frame in range(analysis.frames):
             pressure = file["pressure"][frame]
+            coarser = [file[name][frame] if name in file else None for name in ("coarser", "coarser_rate")]
             yield MemberFrame(
                 frame,
                 analysis.velocity[frame],
@@ -142,6 +150,7 @@ def read_members(path: str | Path, analysis: geometry.Recording) -> Iterator[Mem
                 file["rate"][frame],
                 file["member_rates"][frame],
                 pressure if np.isfinite(pressure).any() else None,
+                *coarser,
             )
 
 

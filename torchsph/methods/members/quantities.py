@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 import geometry
 from torchsph.haemodynamics.domain import PROBE, DomainFrame, FlowDomain
 from torchsph.haemodynamics.pressure import region_mean
 from torchsph.haemodynamics.quantities import Catalogue, catalogue
-from torchsph.haemodynamics.uncertainty import Summary, summary
+from torchsph.haemodynamics.uncertainty import Summary, summary, unresolved
 
 from .frames import MemberFrame
 
@@ -36,21 +36,24 @@ class MemberCurves:
         kind: which quantities they are.
         estimate: of the analysis, by their names, `(T,)`.
         members: of every member, `(N, T)`.
+        coarser: of the analysis as the measurement's kernel would show it once more, `(T,)`; None where none is known.
         pressure: `(T, *shape)`, Pa, the simulator's own where there is one, else that of the velocities; its mean at
             the inlet is 0. None in a plane that blood passes through, whose velocities do not give it.
-        pressure_sigma: `(T, *shape)`, Pa, standard deviation over the members; None like it.
+        pressure_sigma: `(T, *shape)`, Pa, standard deviation over the members, and what the kernel takes once more;
+            None like it.
     """
 
     time: Array
     kind: Catalogue
     estimate: dict[str, Array]
     members: dict[str, Array]
+    coarser: dict[str, Array] | None
     pressure: NDArray[np.float32] | None
     pressure_sigma: NDArray[np.float32] | None
 
     def bands(self) -> dict[str, Summary]:
         """Mean, deviation and band of every curve."""
-        return {name: summary(values) for name, values in self.members.items()}
+        return _bands(self.estimate, self.members, self.coarser)
 
     def beat(self) -> dict[str, Array]:
         """Numbers of the beat of the analysis."""
@@ -58,7 +61,8 @@ class MemberCurves:
 
     def beat_bands(self) -> dict[str, Summary]:
         """Mean, deviation and band of the numbers of the beat."""
-        return {name: summary(values) for name, values in self.kind.beat(self.time, self.members).items()}
+        coarser = None if self.coarser is None else self.kind.beat(self.time, self.coarser)
+        return _bands(self.beat(), self.kind.beat(self.time, self.members), coarser)
 
 
 class MemberQuantities:
@@ -81,6 +85,7 @@ class MemberQuantities:
         self.kind = catalogue(recording.dimension, recording.cut)
         self._sampler = geometry.WallSampler(self.domain.motion, min(self.domain.grid.spacing))
         self._curves: list[Array] = []
+        self._coarser: list[Array] = []  # (0 or 1, quantities) each
         self._pressure: list[NDArray[np.float32]] = []
         self._sigma: list[NDArray[np.float32]] = []
 
@@ -98,21 +103,21 @@ class MemberQuantities:
             warnings.warn(text, RuntimeWarning, stacklevel=2)
 
     def _read(self, frame: MemberFrame) -> None:
-        for kept in (self._curves, self._pressure, self._sigma):
+        for kept in (self._curves, self._coarser, self._pressure, self._sigma):
             del kept[frame.frame :]
         if len(self._curves) != frame.frame:
             raise ValueError(f"frame {frame.frame} comes after {len(self._curves)} frames: they must come in order")
         of_frame = self.kind.frame(self.domain, frame.frame, self._sampler)
-        velocity = np.concatenate([frame.field[None], frame.members])
-        rate = np.concatenate([frame.rate[None], frame.member_rates])
+        velocity, rate = stacked(frame)
         group = max(1, int(_NODES_AT_ONCE / self.domain.grid.size))
         parts = [
             of_frame.of(np.nan_to_num(velocity[k : k + group], posinf=0.0, neginf=0.0), rate[k : k + group])
             for k in range(0, len(velocity), group)
         ]
-        self._curves.append(
-            np.concatenate([np.stack([p.curves[name] for name in self.kind.units], axis=-1) for p in parts])
-        )
+        curves = np.concatenate([np.stack([p.curves[name] for name in self.kind.units], axis=-1) for p in parts])
+        count = 1 + len(frame.members)
+        self._curves.append(curves[:count])
+        self._coarser.append(curves[count:])
         fields = [p.pressure for p in parts if p.pressure is not None]
         if not fields:
             return
@@ -123,31 +128,34 @@ class MemberQuantities:
             simulated = self._gauged(np.where(np.isfinite(frame.pressure), frame.pressure, own), of_frame)
             own = np.where(np.isfinite(frame.pressure), simulated, own)
         self._pressure.append(own.astype(np.float32))
-        self._sigma.append(pressures[1:].std(0, ddof=1).astype(np.float32))
+        spread, lost = pressures[1:count].std(0, ddof=1), (pressures[count:] - pressures[:1]).sum(0)
+        self._sigma.append(np.hypot(spread, lost).astype(np.float32))
 
     def found(self) -> MemberCurves:
         """All that has been found of all frames."""
         if len(self._curves) != len(self.domain.time):
             raise ValueError(f"{len(self._curves)} of {len(self.domain.time)} frames have come: the run did not end")
         curves = np.stack(self._curves)  # (T, 1 + N, quantities)
-        estimate = {name: curves[:, 0, k] for k, name in enumerate(self.kind.units)}
-        members = {name: curves[:, 1:, k].T for k, name in enumerate(self.kind.units)}
+        names, lost = list(self.kind.units), np.concatenate(self._coarser)
+        estimate = {name: curves[:, 0, k] for k, name in enumerate(names)}
+        members = {name: curves[:, 1:, k].T for k, name in enumerate(names)}
+        coarser = {name: lost[:, k] for k, name in enumerate(names)} if len(lost) == len(curves) else None
         pressure, sigma = (np.stack(fields) if fields else None for fields in (self._pressure, self._sigma))
-        return MemberCurves(self.domain.time, self.kind, estimate, members, pressure, sigma)
+        return MemberCurves(self.domain.time, self.kind, estimate, members, coarser, pressure, sigma)
 
     def state(self) -> dict[str, Any]:
         """What a checkpoint has to hold."""
-        kept: dict[str, list[Any]] = {"curves": self._curves, "pressure": self._pressure}
-        kept["sigma"] = self._sigma
+        kept: dict[str, list[Any]] = {name: getattr(self, f"_{name}") for name in self._KEPT}
         tensors = {name: [torch.from_numpy(np.array(each)) for each in values] for name, values in kept.items()}
         return {**tensors, "fault": self.fault}
 
     def restore(self, state: dict[str, Any]) -> None:
         """Go on from what ``state`` gave."""
         self.fault = state["fault"]
-        self._curves, self._pressure, self._sigma = (
-            [np.asarray(each) for each in state[name]] for name in ("curves", "pressure", "sigma")
-        )
+        for name in self._KEPT:
+            setattr(self, f"_{name}", [np.asarray(each) for each in state[name]])
+
+    _KEPT = ("curves", "coarser", "pressure", "sigma")
 
     def _gauged(self, pressure: NDArray[np.floating], of_frame: DomainFrame) -> NDArray[np.float32]:
         """A pressure `(*shape)`, Pa, less its mean around the inlet; 0 outside the mask."""
@@ -157,6 +165,25 @@ class MemberQuantities:
         upper = of_frame.base - probe * of_frame.axis
         at_base = region_mean(pressure, of_frame.mask, self.domain.grid, upper, probe)
         return np.where(of_frame.mask, pressure - at_base, 0.0).astype(np.float32)
+
+
+def stacked(frame: MemberFrame) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
+    """Velocities and rates of the estimate, the members and, where it is there, the coarser estimate."""
+    velocity = [frame.field[None], frame.members]
+    rate = [frame.rate[None], frame.member_rates]
+    if frame.coarser is not None and frame.coarser_rate is not None:
+        velocity, rate = [*velocity, frame.coarser[None]], [*rate, frame.coarser_rate[None]]
+    return np.concatenate(velocity), np.concatenate(rate)
+
+
+def _bands(
+    estimate: Mapping[str, ArrayLike], members: Mapping[str, ArrayLike], coarser: Mapping[str, ArrayLike] | None
+) -> dict[str, Summary]:
+    """A band for each quantity, as wide as members lie apart and as what they all lack is large."""
+    return {
+        name: summary(values, unresolved(estimate[name], values, None if coarser is None else coarser[name]))
+        for name, values in members.items()
+    }
 
 
 def with_pressure(recording: geometry.Recording, curves: MemberCurves | None) -> geometry.Recording:

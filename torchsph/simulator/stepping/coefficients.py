@@ -9,6 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from geometry.arguments import shown
+
 from ..schemes.parts import GammaRamp
 from ..schemes.scheme import Scheme
 from ..state.units import Units
@@ -72,6 +74,7 @@ class Parameters:
 
         Raises:
             ValueError: an unknown name, a number that cannot be, or rows of another length than ``members``.
+            TypeError: no number at all.
         """
         known = [f.name for f in fields(self)]
         for name in values:
@@ -88,7 +91,10 @@ def _checked(
         if name in _NEEDED:
             raise ValueError(f"parameter '{name}' cannot be switched off")
         return None
-    row = torch.as_tensor(value, dtype=like.dtype, device=like.device)
+    try:
+        row = torch.as_tensor(value, dtype=like.dtype, device=like.device)
+    except (TypeError, ValueError, RuntimeError, OverflowError) as fault:
+        raise TypeError(f"parameter '{name}' must be a number, or one for each member, got {shown(value)}") from fault
     if row.ndim and row.shape != (members,):
         raise ValueError(f"parameter '{name}' needs one value, or {members} for the members, got {tuple(row.shape)}")
     fine = row > 0 if name in _NEEDED else row >= 0

@@ -24,11 +24,11 @@ STRAY = 2.0
 # this far beyond the kernel's reach (spacings) the kernel is complete and nothing else of the wall is asked for
 _FAR = 1.0
 # fields kept: the beat is run through in order, and a forecast of 40 ms spans about ten of them
-_KEPT = 12
+TABLES_KEPT = 12
 # cavities kept (a byte a node): a start is seeded with every valve shut, and its first step finds the same times
 _CAVITIES = 4
 # of small grids more are kept, so that a second beat finds those of the first (bytes)
-_MEMORY = 1 << 27
+TABLES_MEMORY = 1 << 27
 
 
 class WallFields:
@@ -104,7 +104,7 @@ class WallFields:
             self._made.move_to_end(label)
             return self._made[label]
         self._made[label] = made = self._make(number, open_regions)
-        kept = max(_KEPT, _MEMORY // (made.numel() * made.element_size()))
+        kept = max(TABLES_KEPT, TABLES_MEMORY // (made.numel() * made.element_size()))
         while len(self._made) > kept:
             self._made.popitem(last=False)
         return made

@@ -110,6 +110,11 @@ def test_quantities_are_those_of_every_member(given, followed):
     for name in set(UNITS) - {"force_axial", "force_across", "pressure_difference"}:  # which ask for du/dt
         np.testing.assert_allclose(found.members[name][1], alone[name], rtol=1e-6, err_msg=name)
     bands = found.bands()
+    # the estimate as its measurement's kernel shows it once more is read out as well, and only widens the bands
+    assert all(frame.coarser is not None and frame.coarser.shape == frame.field.shape for frame in frames)
+    for name in UNITS:
+        lost = np.abs(found.estimate[name] - found.coarser[name])
+        assert (bands[name].deviation >= np.maximum(found.members[name].std(0, ddof=1), lost) * (1 - 1e-9)).all(), name
     assert all((bands[name].deviation > 0).all() for name in ("kinetic_energy", "energy_loss", "pressure_difference"))
     # a quadratic of the mean is smaller than the mean of the quadratic
     assert (bands["kinetic_energy"].mean > found.estimate["kinetic_energy"]).all()
@@ -123,6 +128,8 @@ def test_kept_members_give_the_same_quantities(given, followed, tmp_path):
     recording, frames, found, path = followed
     again = quantified(recording, read_members(path, recording))
     for name in UNITS:
+        tolerance = {"rtol": 2e-2, "atol": 1e-3 * np.abs(found.members[name]).max()}
+        np.testing.assert_allclose(again.coarser[name], found.coarser[name], **tolerance)
         np.testing.assert_allclose(
             again.members[name], found.members[name], rtol=2e-2, atol=1e-3 * np.abs(found.members[name]).max()
         )
