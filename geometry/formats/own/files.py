@@ -253,14 +253,11 @@ def _fields(files: Sequence[Path], said: FieldMap, mark: Mark) -> dict[str, np.n
         if name in SCALARS:
             label = said.mask.removesuffix("mask") + name
             found[name] = read_fields(files, replace(said, weight=label, sigma=()), "").weight
-        elif name == "beam":
-            beam = tuple(f"beam_{letter}" for letter in "xyz") if len(said.velocity) > 1 else (_beam(said),)
-            found[name] = read_fields(files, replace(said, velocity=beam, sigma=()), "").velocity
+        elif name in ("beam", "normal"):
+            labels = tuple(f"{name}_{letter}" for letter in "xyz")
+            unit = labels if len(said.velocity) > 1 else (said.mask.removesuffix("mask") + name,)
+            found[name] = read_fields(files, replace(said, velocity=unit, sigma=()), "").velocity
     return {name: _flat(found[name], first, mark) for name in mark.fields if found.get(name) is not None}  # type: ignore[misc]
-
-
-def _beam(said: FieldMap) -> str:
-    return said.mask.removesuffix("mask") + "beam"
 
 
 def _flat(values: np.ndarray, fields: Fields, mark: Mark) -> np.ndarray:
