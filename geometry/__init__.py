@@ -2,10 +2,12 @@
 
 from .grids.grid import Grid, Stencil
 from .grids.unwrapping import unwrap
+from .motion.beats import Repetition, repetition, split_beats, told_apart
 from .motion.estimates import Estimates, estimated
 from .motion.moving_distance import MovingDistance, WallField, WallPoint
 from .motion.orifices import Orifice, OrificePlane, orifices
 from .motion.plane_cut import plane_cut
+from .motion.planes_in_space import PlacedPlane, planes_in_space
 from .motion.refine import refined, refined_motion
 from .motion.valve_times import ValveTimes, find_valve_times
 from .motion.wall_estimate import WallEstimate, estimate_wall
@@ -45,9 +47,11 @@ __all__ = [
     "OpeningFlux",
     "Orifice",
     "OrificePlane",
+    "PlacedPlane",
     "Quality",
     "Recording",
     "RecordingError",
+    "Repetition",
     "Stencil",
     "Surface",
     "SurfaceError",
@@ -76,6 +80,7 @@ __all__ = [
     "openings",
     "orifices",
     "plane_cut",
+    "planes_in_space",
     "polygon",
     "read_provenance",
     "read_recording",
@@ -83,12 +88,15 @@ __all__ = [
     "refined",
     "refined_motion",
     "repaired",
+    "repetition",
     "revolved",
     "signed_distance",
+    "split_beats",
     "surface_from_mask",
     "surface_from_points",
     "surface_from_velocity",
     "taubin",
+    "told_apart",
     "tube",
     "unwrap",
     "wall_points",

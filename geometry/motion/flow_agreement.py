@@ -56,7 +56,8 @@ def flow_agreement(recording: Recording, valves: ValveTimes) -> FlowAgreement | 
         recording: with walls, whose motion is estimated already.
         valves: when its openings are open.
     """
-    if recording.beam is not None or recording.wall is None or not recording.wall.moves:
+    seen_whole = recording.beam is None and recording.normal is None
+    if not seen_whole or recording.wall is None or not recording.wall.moves:
         return None
     motion = WallMotion.from_recording(recording)
     rate = np.array([motion.volume_rate(float(t)) for t in recording.time])

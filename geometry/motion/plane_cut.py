@@ -67,7 +67,7 @@ def plane_cut(
     """
     if recording.dimension != 3:
         raise ValueError("plane_cut: the recording is a plane already; cut a volume")
-    frame = _axes(right, up)
+    frame = plane_axes(right, up)
     place = np.asarray(origin, np.float64)
     motion = WallMotion.from_recording(recording)
     wall = _section(motion, recording, place, frame)
@@ -92,7 +92,7 @@ def plane_cut(
     return _planar(recording, grid, mask, wall, frame, on_plane)
 
 
-def _axes(right: Sequence[float], up: Sequence[float]) -> np.ndarray:
+def plane_axes(right: Sequence[float], up: Sequence[float]) -> np.ndarray:
     """(3, 3) unit vectors: x, y of the plane and its normal."""
     x, y = (np.asarray(part, np.float64) for part in (right, up))
     if x.shape != (3,) or y.shape != (3,) or not np.isfinite([x, y]).all():

@@ -40,7 +40,7 @@ def best_order(recording: Recording) -> tuple[str, float, float] | None:
         The order as `-y,x,z` (the component stored first is that of minus y), the RMS of the divergence
         relative to that of the gradient as claimed and for that order; None where too little is measured.
     """
-    if recording.dimension != 3 or recording.beam is not None:
+    if recording.dimension != 3 or recording.beam is not None or recording.normal is not None:
         return None
     products = derivative_products(recording.velocity, measured_nodes(recording), recording.grid.spacing)
     if products is None:

@@ -201,8 +201,42 @@ class AlongBeam(MeasurementType):
         return (self.beam[frame] if self.moving else self.beam)[None]
 
 
+class WithinPlanes(MeasurementType):
+    """Both components within planes in space, each node in its own: echo planes of several views.
+
+    Args:
+        normal: (T, 3, *shape), or (3, *shape) for all frames, unit vectors of the planes; anything where nothing was
+            measured.
+    """
+
+    name = "two components within planes"
+    dataset = "/normal"
+
+    def __init__(self, normal: np.ndarray) -> None:
+        self.normal, self.moving = normal, normal.ndim == 5
+
+    @classmethod
+    def of(cls, recording: Recording) -> WithinPlanes | None:
+        """The type of a recording of planes in space."""
+        return None if recording.normal is None else cls(recording.normal)
+
+    @property
+    def parts(self) -> int:
+        """Number of components at a node: two."""
+        return 2
+
+    def directions(self, frame: int) -> np.ndarray:
+        """(2, 3, *shape) unit vectors at right angles to the normal and to each other."""
+        normal = np.nan_to_num(self.normal[frame] if self.moving else self.normal).astype(np.float64)
+        # the axis that the normal follows least is far from it everywhere
+        axis = np.moveaxis(np.eye(3)[np.abs(normal).argmin(0)], -1, 0)
+        first = np.cross(normal, axis, axis=0)
+        first /= np.maximum(np.sqrt((first**2).sum(0)), 1e-12)
+        return np.stack([first, np.cross(normal, first, axis=0)])
+
+
 # in the order in which they are asked for a recording; the last one takes what nobody claims
-MEASUREMENT_TYPES: tuple[type[MeasurementType], ...] = (AlongBeam, FullVectors)
+MEASUREMENT_TYPES: tuple[type[MeasurementType], ...] = (AlongBeam, WithinPlanes, FullVectors)
 
 
 @checked

@@ -31,6 +31,7 @@ LAYOUT: tuple[tuple[str, str, type], ...] = (
     ("uncovered", "/uncovered", np.int64),
     ("quality", "/quality", np.uint8),
     ("beam", "/beam", np.float32),
+    ("normal", "/normal", np.float32),
     ("nyquist", "/nyquist", np.float64),
     ("pressure", "/pressure", np.float32),
     ("pressure_sigma", "/pressure_sigma", np.float32),
@@ -112,6 +113,7 @@ class Recording:
         uncovered: (T,), nodes inside the mask for which a method has no value.
         quality: (T, *shape), codes of `Quality`: why an analysis is what it is at each node.
         beam: (T, D, *shape) or (D, *shape), unit vectors along which alone the velocity was measured.
+        normal: (T, 3, *shape) or (3, *shape), unit vectors along which alone nothing was measured: planes in space.
         pressure: (T, *shape), Pa, gauge.
         pressure_sigma: (T, *shape), Pa, standard deviation of the pressure.
         valve_intervals: (n, 3), rows (region, opens, closes), s.
@@ -153,6 +155,7 @@ class Recording:
     fluxes: tuple[OpeningFlux, ...] = ()
     nyquist: np.ndarray | None = None
     cut: bool = False
+    normal: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         _check_kinds(self)
@@ -225,7 +228,7 @@ class Recording:
         for name, _, _ in LAYOUT:
             value = None if name.startswith("wall.") else getattr(self, name)
             still = name in ("valve_intervals", "valve_leak") or (
-                name == "beam" and value is not None and value.ndim == self.dimension + 1
+                name in ("beam", "normal") and value is not None and value.ndim == self.dimension + 1
             )
             if value is not None and not still:
                 changes[name] = value[chosen]
@@ -243,9 +246,9 @@ class Recording:
     ) -> Recording:
         """Another velocity (T, D, *shape), m/s, between the same walls: an analysis or a forecast.
 
-        What belonged to the old velocity (weight, sigma, quality, beam, nyquist, pressure, fluxes) is dropped.
+        What belonged to the old velocity (weight, sigma, quality, beam, normal, nyquist, pressure, fluxes) is dropped.
         """
-        gone: dict[str, Any] = dict.fromkeys(("weight", "beam", "nyquist", "pressure", "pressure_sigma"))
+        gone: dict[str, Any] = dict.fromkeys(("weight", "beam", "normal", "nyquist", "pressure", "pressure_sigma"))
         gone |= dict.fromkeys(("flux_mitral", "flux_aortic"))
         text = self.description if description is None else description
         new: dict[str, Any] = {"velocity": velocity, "sigma": sigma, "uncovered": uncovered, "quality": quality}
@@ -340,6 +343,7 @@ def _allowed_shapes(recording: Recording) -> dict[str, tuple[tuple[int, ...], ..
         "/uncovered": ((frames,),),
         "/quality": ((frames, *shape),),
         "/beam": ((frames, dimension, *shape), (dimension, *shape)),
+        "/normal": ((frames, 3, *shape), (3, *shape)),
         "/nyquist": ((frames,),) if recording.beam is not None else ((frames,), (frames, dimension)),
         "/pressure": ((frames, *shape),),
         "/pressure_sigma": ((frames, *shape),),

@@ -54,6 +54,7 @@ def check_recording(recording: Recording, source: str = "recording") -> None:
         _speed,
         _sigma,
         _beam,
+        _normal,
         _nyquist,
         _overlap,
         _valves,
@@ -137,7 +138,7 @@ def _weight(recording: Recording, source: str) -> None:
 
 def _finite(recording: Recording, source: str) -> None:
     measured, components = measured_nodes(recording), -1 - recording.dimension
-    for dataset in ("/velocity", "/sigma", "/beam", "/pressure", "/pressure_sigma"):
+    for dataset in ("/velocity", "/sigma", "/beam", "/normal", "/pressure", "/pressure_sigma"):
         field = recording.arrays().get(dataset)
         if field is None:
             continue
@@ -170,13 +171,25 @@ def _sigma(recording: Recording, source: str) -> None:
 
 
 def _beam(recording: Recording, source: str) -> None:
-    if recording.beam is None:
+    if recording.beam is not None:
+        _unit_vectors(recording, recording.beam, source, "/beam")
+
+
+def _normal(recording: Recording, source: str) -> None:
+    if recording.normal is None:
         return
-    length = np.sqrt((recording.beam.astype(np.float64) ** 2).sum(axis=-1 - recording.dimension))
+    if recording.dimension != 3 or recording.beam is not None or recording.nyquist is not None:
+        rule = "is of planes in space that hold both components in the plane, neither wrapped nor along a beam"
+        raise RecordingError(source, "/normal", f"{rule}; leave out /normal, /beam or /nyquist")
+    _unit_vectors(recording, recording.normal, source, "/normal")
+
+
+def _unit_vectors(recording: Recording, field: np.ndarray, source: str, dataset: str) -> None:
+    length = np.sqrt((field.astype(np.float64) ** 2).sum(axis=-1 - recording.dimension))
     bad = measured_nodes(recording) & (np.abs(length - 1) > 1e-3)
     if bad.any():
         rule = f"must hold unit vectors, but does not at {_first(bad)}; divide by their length"
-        raise RecordingError(source, "/beam", rule)
+        raise RecordingError(source, dataset, rule)
 
 
 def _nyquist(recording: Recording, source: str) -> None:

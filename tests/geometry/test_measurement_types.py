@@ -5,7 +5,7 @@ import pytest
 import torch
 
 import geometry
-from geometry.recordings.measurement_types import MEASUREMENT_TYPES, AlongBeam, Components, FullVectors
+from geometry.recordings.measurement_types import MEASUREMENT_TYPES, AlongBeam, Components, FullVectors, WithinPlanes
 
 FRAMES, SHAPE = 3, (4, 5, 6)
 
@@ -19,6 +19,8 @@ MEASURED = {
     "full vectors": FullVectors(3),
     "one beam for all frames": AlongBeam(unit_vectors(), 3),
     "a beam that moves": AlongBeam(unit_vectors(FRAMES), 3),
+    "planes for all frames": WithinPlanes(unit_vectors()),
+    "planes that move": WithinPlanes(unit_vectors(FRAMES)),
 }
 
 
@@ -84,7 +86,7 @@ def test_what_needs_vectors_is_refused(kind):
     if kind.full:
         kind.require_full("this imposes")
     else:
-        with pytest.raises(ValueError, match="this imposes full vectors and the measurement holds one component"):
+        with pytest.raises(ValueError, match="this imposes full vectors and the measurement holds (one|two) component"):
             kind.require_full("this imposes")
 
 

@@ -38,7 +38,10 @@ PLANE_CAUTION = (
     "they need the flow in space: volumes and fractions of them, forces, helicity, vortex rings, transit of blood"
 )
 
-CUT_CAUTION = ", and the pressure (from a plane that blood passes through, a third of its difference is wrong)"
+CUT_CAUTION = (
+    ", and the pressure (from a plane that blood passes through, a third of its difference is wrong). Flows through "
+    "openings come out at half of the true ones in smooth fields"
+)
 
 
 def plain_curves(recording: geometry.Recording) -> Curves:

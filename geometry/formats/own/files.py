@@ -254,15 +254,12 @@ def _fields(files: Sequence[Path], said: FieldMap, mark: Mark) -> dict[str, np.n
         if name in SCALARS:
             label = said.mask.removesuffix("mask") + name
             found[name] = read_fields(files, replace(said, weight=label, sigma=()), "").weight
-        elif name == "beam":
-            beam = tuple(f"beam_{letter}" for letter in "xyz") if len(said.velocity) > 1 else (_beam(said),)
-            found[name] = read_fields(files, replace(said, velocity=beam, sigma=()), "").velocity
+        elif name in ("beam", "normal"):
+            labels = tuple(f"{name}_{letter}" for letter in "xyz")
+            unit = labels if len(said.velocity) > 1 else (said.mask.removesuffix("mask") + name,)
+            found[name] = read_fields(files, replace(said, velocity=unit, sigma=()), "").velocity
     there = {name: values for name, values in found.items() if name in mark.fields and values is not None}
     return {name: _flat(values, first, mark) for name, values in there.items()}
-
-
-def _beam(said: FieldMap) -> str:
-    return said.mask.removesuffix("mask") + "beam"
 
 
 def _flat(values: np.ndarray, fields: Fields, mark: Mark) -> np.ndarray:

@@ -27,7 +27,7 @@ from ..source import FormatError
 
 MARK = "torchsph_recording"
 SOURCE = "torchsph_source"  # in the place of the mark, the file beside it whose values are shown
-FIELDS = ("velocity", "mask", "weight", "sigma", "pressure", "pressure_sigma", "beam")
+FIELDS = ("velocity", "mask", "weight", "sigma", "pressure", "pressure_sigma", "beam", "normal")
 NUMBERS = ("rho", "mu", "period")
 TYPES = ("<f8", "<f4", "<i8", "<i4", "|u1", "|b1")
 LARGEST = 1 << 30  # bytes of one array that is packed

@@ -10,9 +10,9 @@ from geometry.formats.source import FormatError
 from geometry.recordings.recording import Recording, Wall
 
 UNITS = {"velocity": "m s-1", "sigma": "m s-1", "pressure": "Pa", "pressure_sigma": "Pa"}
-UNITS |= {"mask": "1", "weight": "1", "beam": "1"}
+UNITS |= {"mask": "1", "weight": "1", "beam": "1", "normal": "1"}
 SCALARS = ("mask", "weight", "pressure", "pressure_sigma")
-VECTORS = ("velocity", "sigma", "beam")
+VECTORS = ("velocity", "sigma", "beam", "normal")
 
 
 def vector(recording: Recording, name: str) -> np.ndarray | None:

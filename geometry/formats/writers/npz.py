@@ -16,6 +16,6 @@ def write_npz(path: Path, recording: Recording) -> list[Path]:
     content: dict[str, Any] = {name.strip("/").replace("/", "_"): values for name, values in recording.arrays().items()}
     content |= {name: np.float64(getattr(recording, name)) for name in ("rho", "mu", "period")}
     content |= {"origin": np.array(recording.grid.origin), "spacing": np.array(recording.grid.spacing)}
-    content[MARK] = np.array(marked(recording, [name for name in FIELDS if name != "beam"]))
+    content[MARK] = np.array(marked(recording, [name for name in FIELDS if name not in ("beam", "normal")]))
     np.savez_compressed(path, **content)
     return [path]

@@ -70,6 +70,18 @@ def test_every_export_comes_back_whole_without_an_option(full: Recording, tmp_pa
         assert_all_of_it(full, convert([path for path in files if path.suffix == ".vti"]).recording)
 
 
+@pytest.mark.parametrize("to", sorted(EXPORTS))
+def test_planes_in_space_come_back_with_their_normals(recording: Recording, tmp_path: Path, to: str) -> None:
+    if to in PACKAGES:
+        pytest.importorskip(PACKAGES[to], reason=EXTRA)
+    normal = np.stack(
+        [np.zeros(recording.grid.shape), np.full(recording.grid.shape, 0.6), np.full(recording.grid.shape, 0.8)]
+    )
+    planes = replace(recording, normal=normal, beam=None, nyquist=None)
+    files = export(planes, tmp_path / "a.b", to)
+    assert_all_of_it(planes, convert([files[0]]).recording)
+
+
 def test_slips_of_a_caller_are_told_where_they_enter(recording: Recording, tmp_path: Path) -> None:
     surface = recording.wall_for("the test").at(0)
     with pytest.raises(ValueError, match="write_surface: scale must be positive"):

@@ -19,6 +19,7 @@ from torchsph.evaluation import figures, metrics
 from torchsph.evaluation.scores import Scores
 from torchsph.methods import by_name
 from torchsph.methods.budget import Afforded, ensemble_spacing
+from torchsph.methods.measurement.beats import stitched
 from torchsph.methods.runtime import checkpoint, parallel
 from torchsph.methods.runtime.workers import chosen_workers
 from torchsph.report import write_report
@@ -49,6 +50,11 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
         default=[],
         metavar="FILE.h5",
         help="a further measurement of the same beat, with its own grid, times and errors (repeatable)",
+    )
+    parser.add_argument(
+        "--beats",
+        action="store_true",
+        help="the files hold several beats: the first whole one is analysed, the others are further measurements of it",
     )
     add_method_options(parser)
     parser.add_argument("--resume", action="store_true", help="go on with the ensemble where DIR/checkpoint.pt left it")
@@ -97,6 +103,8 @@ def assimilate(args: argparse.Namespace) -> None:
         account = provenance(args, {"measurement": measured_path, "truth": truth_path, "also": args.also})
         measured = informative(geometry.read_recording(measured_path), measured_path)
         also = [informative(geometry.read_recording(path), path) for path in args.also]
+        if args.beats:
+            (measured, *also), _ = stitched([measured, *also])
         truth = None if truth_path is None else geometry.read_recording(truth_path)
         kept = folder / SPACING_FILE if "ensemble" in methods and lead else None
         if not args.resume and kept is not None:

@@ -120,6 +120,7 @@ def summary_table(recording: geometry.Recording) -> list[list[str]]:
         "uncovered",
         "quality",
         "beam",
+        "normal",
         "nyquist",
         "pressure",
         "pressure_sigma",

@@ -118,6 +118,8 @@ def estimate_error(
             chosen = float(np.mean((np.array(choice.noise) / robust[frame]) ** 2))
             redundancy[frame] = max(redundancy[frame], chosen)
     trust = 0.0 if told or measured.weight is None else _trust(measured, residual / robust.reshape(-1, parts, *ones))
+    if parts not in (1, measured.dimension):  # components of the instrument's own: the vector's share their mean
+        robust = np.sqrt(np.mean(robust**2, axis=1, keepdims=True))
     deviation = None if told else np.broadcast_to(robust, (len(robust), measured.dimension)).copy()
     return ObservationError(deviation, np.maximum(redundancy, 1.0), surprise, kernel, trust)
 
