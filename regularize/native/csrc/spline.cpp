@@ -10,6 +10,7 @@
 #include <optional>
 #include <vector>
 
+#include "basis.hpp"
 #include "guard.hpp"
 #include "processor.hpp"
 #include "spline.hpp"
@@ -35,9 +36,6 @@ constexpr int kWorthThreads = 4096;   // rows: with fewer the threads' meetings 
 constexpr int kDepth = 32;            // points whose stencils are buffered before they are summed
 constexpr int kAhead = 16;             // rows whose targets are fetched before they are needed
 
-// Inlined into a caller that knows the sizes at compile time, these small loops become straight vector code.
-#define SPLINE_INLINE inline __attribute__((always_inline))
-
 enum Kind : int32_t { kVector = 0, kDirection = 1, kDivergence = 2, kCellScalar = 3, kCellCoupled = 4 };
 
 constexpr int power(int base, int exponent) { return exponent == 0 ? 1 : base * power(base, exponent - 1); }
@@ -54,45 +52,6 @@ struct Sizes {
   }
   static SPLINE_INLINE int local(const SplineGrid& g) { return kAxes ? power(kDegree + 1, kAxes) : local_size(g); }
 };
-
-// 1-D basis values of one point, and their derivatives per metre.
-struct Basis {
-  double value[kMaxAxes][kMaxOrder], slope[kMaxAxes][kMaxOrder];
-
-  SPLINE_INLINE Basis(const SplineGrid& g, const double* t, bool slopes) {
-    const int order = g.degree + 1;
-    for (int a = 0; a < g.axes; ++a) {
-      double* v = value[a];
-      double* s = slope[a];
-      for (int i = 0; i < order; ++i) v[i] = g.pieces[(order - 1) * order + i], s[i] = 0;
-      for (int k = order - 2; k >= 0; --k) {  // Horner for the polynomials and their derivatives together
-        const double* power = g.pieces + k * order;
-#pragma omp simd
-        for (int i = 0; i < order; ++i) {
-          s[i] = s[i] * t[a] + v[i];
-          v[i] = v[i] * t[a] + power[i];
-        }
-      }
-      if (slopes)
-        for (int i = 0; i < order; ++i) s[i] /= g.spacing[a];
-    }
-  }
-};
-
-// Products of 1-D values; the 1-D derivative on one axis (or -1 for none), times scale.
-SPLINE_INLINE void stencil(const SplineGrid& g, const Basis& basis, int derived, double scale, double* out) {
-  const int order = g.degree + 1;
-  out[0] = scale;
-  int size = 1;
-  for (int a = 0; a < g.axes; ++a) {
-    const double* one = a == derived ? basis.slope[a] : basis.value[a];
-    for (int i = size - 1; i >= 0; --i) {  // downwards: the products are expanded in place
-      const double left = out[i];
-      for (int k = 0; k < order; ++k) out[i * order + k] = left * one[k];
-    }
-    size *= order;
-  }
-}
 
 // The row of component k at point n, without the weight of kVector rows.
 SPLINE_INLINE void row_of(const SplineGrid& g, const SplineRows& rows, const Basis& basis, int64_t n, int k,

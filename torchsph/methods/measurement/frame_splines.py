@@ -188,23 +188,9 @@ class FrameSmoother:
 
     def _chosen(self, frame: int) -> regularize.Choice | None:
         """What the fit of a frame alone would choose."""
-        points, rows, confidence, _ = self._samples(frame)
+        points, rows, confidence, _ = _samples(self, frame)
         where = self._inside(frame)
         return self._trusting(frame).choose(points, rows, confidence, self._walls(frame), divergence_points=where)
-
-    def _samples(self, frame: int) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
-        """Points (n, D), velocities (n, D), confidences (n,) and beams of a frame, for the rows of its spline."""
-        recording, dimension = self.recording, self.recording.dimension
-        mask = torch.from_numpy(np.array(recording.mask[frame], bool).reshape(-1))
-        weight = torch.from_numpy(node_weights(recording, frame).astype(np.float64).reshape(-1))
-        used = (weight > 0) & mask
-        if not bool(used.any()):
-            time = float(recording.time[frame])
-            raise ValueError(f"frame {frame} (t = {time:g} s) has no node with a positive weight inside the mask")
-        field = recording.velocity[frame].reshape(dimension, -1)
-        samples = torch.from_numpy(np.nan_to_num(field, copy=True)).double().T
-        components = self.type.at(frame, torch.nonzero(used).squeeze(1))
-        return components.spline_rows(self.nodes[used], samples[used], weight[used])
 
     def _fit(
         self,
@@ -215,7 +201,7 @@ class FrameSmoother:
         walls: bool = True,
     ) -> regularize.SplineField:
         recording = self.recording
-        points, rows, confidence, beam = self._samples(frame)
+        points, rows, confidence, beam = _samples(self, frame)
         together = self._open_together(frame)
         known_flux = walls and self.motion is not None and (bool(recording.fluxes) or bool(together)) and self.type.full
         smoother = self._trusting(frame) if walls else self.smoother
@@ -312,6 +298,21 @@ class FrameSmoother:
         out = np.zeros((grid.dimension, grid.size), np.float32)
         out[:, mask] = fitted(self.nodes[torch.from_numpy(mask)], outside=0.0).T.numpy()
         return out.reshape(grid.dimension, *grid.shape)
+
+
+def _samples(frames: FrameSmoother, frame: int) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
+    """Points (n, D), velocities (n, D), confidences (n,) and beams of a frame, for the rows of its spline."""
+    recording, dimension = frames.recording, frames.recording.dimension
+    mask = torch.from_numpy(np.array(recording.mask[frame], bool).reshape(-1))
+    weight = torch.from_numpy(node_weights(recording, frame).astype(np.float64).reshape(-1))
+    used = (weight > 0) & mask
+    if not bool(used.any()):
+        time = float(recording.time[frame])
+        raise ValueError(f"frame {frame} (t = {time:g} s) has no node with a positive weight inside the mask")
+    field = recording.velocity[frame].reshape(dimension, -1)
+    samples = torch.from_numpy(np.nan_to_num(field, copy=True)).double().T
+    components = frames.type.at(frame, torch.nonzero(used).squeeze(1))
+    return components.spline_rows(frames.nodes[used], samples[used], weight[used])
 
 
 def _middle(frames: FrameSmoother, group: int) -> int | None:
