@@ -19,10 +19,10 @@ from geometry.surfaces.files import holds_surface
 from .assemble import Fields
 from .displacement import MotionOptions
 from .field_map import FieldMap
-from .own_files import own_recording
+from .own.files import own_recording
 from .readers.hdf5 import text
 from .series import read_fields
-from .source import FormatError, understood
+from .source import FormatError, refuse_streams, understood
 from .walls import inside_at, wall_by_displacements, wall_from_files, wall_from_mask
 
 ADDED = ("nyquist", "cut", "period")  # what is added to a recording that there is
@@ -106,9 +106,11 @@ def convert(
     paths = [Path(name) for name in inputs]
     if not paths:
         raise FormatError("convert: no file is named")
-    missing = [path for path in (*paths, *map(Path, (*wall.files, *wall.motion.files))) if not path.exists()]
+    every = [*paths, *map(Path, (*wall.files, *wall.motion.files))]
+    missing = [path for path in every if not path.exists()]
     if missing:
         raise FileNotFoundError(f"{missing[0]}: there is no such file")
+    refuse_streams(every)
     about = _Constants(rho, mu, said.period)
     text_of = description or f"converted from {paths[0].name}" + (
         f" and {len(paths) - 1} more" if len(paths) > 1 else ""

@@ -14,7 +14,7 @@ import numpy as np
 from geometry.arguments import checked
 from geometry.recordings.units import factor
 
-from .source import FormatError
+from .source import FormatError, refuse_streams
 
 AXES = set("tcxyz")
 
@@ -109,9 +109,10 @@ def read_field_map(path: str | Path) -> FieldMap:
         FormatError: no TOML file, or a key or value that is not known.
     """
     path = Path(path)
+    refuse_streams([path])
     try:
         content = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as fault:
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as fault:
         raise FormatError(f"{path}: is no TOML file ({fault})") from fault
     known = {item.name for item in fields(FieldMap)}
     unknown = sorted(set(content) - known)

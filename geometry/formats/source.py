@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Protocol
 
 import numpy as np
@@ -15,6 +16,17 @@ from geometry.surfaces.surface import SurfaceError
 
 class FormatError(ValueError):
     """A file that cannot be converted; the text names it, the rule broken and what to do."""
+
+
+def refuse_streams(paths: Iterable[Path]) -> None:
+    """Refuse what would be waited for, or never ends.
+
+    Raises:
+        FormatError: a device, a pipe or a socket; folders are some formats' own.
+    """
+    for path in paths:
+        if path.exists() and not (path.is_file() or path.is_dir()):
+            raise FormatError(f"{path}: is a device, a pipe or a socket; name a file")
 
 
 @contextmanager

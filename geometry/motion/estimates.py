@@ -70,7 +70,8 @@ class Estimates:
 def estimated(recording: Recording) -> Estimates:
     """Estimate the wall motion (``estimate_wall``) and the valve times (``find_valve_times``) of a recording.
 
-    Exact walls and times that can be so come back as they are, bit for bit.
+    Exact walls and times that can be so come back as they are, bit for bit. Velocities that are NaN, where nothing was
+    measured, stay so.
     """
     if recording.wall is None:
         return Estimates(recording, None, None)

@@ -54,7 +54,10 @@ class WallField:
 
     @checked
     def at(self, points: Tensor) -> WallPoint:
-        """Distance, normal and wall velocity at points `(n, D)`, m; off the grid its nearest values."""
+        """Distance, normal and wall velocity at points `(n, D)`, m; off the grid its nearest values.
+
+        A point that is not finite gets NaN, and spoils no other.
+        """
         dimension = self.grid.dimension
         values = self.grid.sample(self.table, points)
         normal = torch.nn.functional.normalize(values[1 : 1 + dimension].T, dim=-1, eps=1e-12)

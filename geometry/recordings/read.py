@@ -89,7 +89,7 @@ def read_provenance(path: str | Path) -> dict[str, Any] | None:
         text = _text(file, "provenance", source)
     try:
         found = json.loads(text)
-    except ValueError:
+    except (ValueError, RecursionError):
         return None
     return found if isinstance(found, dict) else None
 

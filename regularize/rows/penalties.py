@@ -6,6 +6,7 @@ limit on fine knots). All derivatives are per metre and the integrals in m^A.
 """
 
 from collections.abc import Sequence
+from functools import lru_cache
 from itertools import product
 
 import numpy as np
@@ -15,14 +16,22 @@ from regularize.basis.bspline import interval_gram
 from regularize.basis.knots import Knots
 from regularize.errors import InvalidInput
 
+KEPT = 64  # integrals, of 32 kB each for cubic splines in space
+
 
 def product_gram(knots: Knots, first: Sequence[int], second: Sequence[int]) -> np.ndarray:
     """(L, L): integral over a cell of d^first B_i times d^second B_j; orders per axis, x first."""
+    return _product(knots.spacing, knots.degree, tuple(first), tuple(second))
+
+
+@lru_cache(maxsize=KEPT)  # frames share their knot distances
+def _product(spacing: tuple[float, ...], degree: int, first: tuple[int, ...], second: tuple[int, ...]) -> np.ndarray:
     gram: np.ndarray = np.ones((1, 1))
-    for axis in reversed(range(knots.axes)):
-        h = knots.spacing[axis]
-        one = interval_gram(knots.degree, first[axis], second[axis]) * h ** (1 - first[axis] - second[axis])
+    for axis in reversed(range(len(spacing))):
+        h = spacing[axis]
+        one = interval_gram(degree, first[axis], second[axis]) * h ** (1 - first[axis] - second[axis])
         gram = np.kron(gram, one)
+    gram.flags.writeable = False
     return gram
 
 

@@ -6,11 +6,14 @@ Twice the memory of one copy, but A' u then runs as fast as A v. The matrix-free
 import warnings
 from collections.abc import Callable
 
+import numpy as np
 import torch
+from scipy.sparse import csr_array
 
 from regularize.arguments import checked
 
 from .operators import CellRows, RowBlock, System, VectorRows, at_points
+from .ordering import Ordering
 
 Apply = Callable[[torch.Tensor], torch.Tensor]
 
@@ -77,3 +80,13 @@ def _cell_entries(block: CellRows, nodes: torch.Tensor, c: int) -> tuple[torch.T
     column = (nodes[:, None, None, :] * c + torch.arange(c)[:, None]).expand(cells, rows, c, -1)
     value = factor[:, None, :].expand(cells, rows, c, -1)
     return column.flatten(0, 2), value.flatten(0, 2)
+
+
+def value_matrix(fit: VectorRows, ordering: Ordering) -> csr_array:
+    """(n, active) values of the coefficients' functions, in solve order, at the samples."""
+    nodes, values = fit.knots.local_nodes(fit.cell), fit.rows_at(slice(None)).double()
+    place = torch.empty(fit.knots.nodes, dtype=torch.int64)
+    place[ordering.nodes] = torch.arange(len(ordering.nodes))
+    starts = np.arange(0, nodes.numel() + 1, nodes.shape[1])
+    shape = (len(nodes), len(ordering.nodes))
+    return csr_array((values.flatten().numpy(), place[nodes].flatten().numpy(), starts), shape=shape)

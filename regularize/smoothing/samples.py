@@ -6,6 +6,7 @@ from functools import cached_property
 from math import prod
 from typing import Any
 
+import numpy as np
 import torch
 from scipy.spatial import ConvexHull, QhullError
 
@@ -122,9 +123,16 @@ class FitData:
         """Volume (area in 2-D) that samples and walls span, in m^D; 0 where they lie in one plane."""
         cloud = self.points if self.wall is None else torch.cat([self.points, self.wall.points])
         try:
-            return float(ConvexHull(cloud[:, : self.components].detach().double().cpu().numpy()).volume)
+            return float(ConvexHull(_ends(cloud[:, : self.components].detach().double().cpu().numpy())).volume)
         except (QhullError, ValueError):  # fewer than D + 1 points, or all in one plane
             return 0.0
+
+
+def _ends(cloud: np.ndarray) -> np.ndarray:
+    """The points (n, D) without those between two others on a line along the first axis: they are no corners."""
+    order = np.lexsort(cloud.T)
+    line = np.any(np.diff(cloud[order, 1:], axis=0) != 0, axis=1)
+    return cloud[order[np.append(True, line) | np.append(line, True)]]
 
 
 def _checked_samples(

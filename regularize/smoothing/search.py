@@ -9,8 +9,10 @@ from regularize.options import SplineOptions, length_of
 from regularize.rows.operators import CellRows, DivergenceRows, VectorRows
 from regularize.rows.penalties import row_factor
 from regularize.solvers.direct import solve_direct
+from regularize.statistics.extrapolation import Extrapolation
 from regularize.statistics.gcv import cross_validate
-from regularize.statistics.likelihood import Choice, Groups, LikelihoodSearch, Start
+from regularize.statistics.likelihood import Choice, LikelihoodSearch, Start
+from regularize.statistics.row_groups import Groups
 
 from .problem import Problem
 from .row_blocks import build_system, penalty_blocks, smoothness_gram, wall_roots
@@ -40,6 +42,7 @@ def choose(options: SplineOptions, knots: Knots, data: FitData) -> Choice | None
         if search.unknowns > WORTH_COARSER:
             fewer = _search(options, knots.spread_out(COARSER * options.search_knots), data)
             start = fewer.run(start, options.rounds).start
+            search.ahead = Extrapolation(fewer.ahead)  # near the end both move alike
         choice = search.run(start, options.rounds)
         return _counting_shared_errors(options, coarse, data, choice) if options.correlated else choice
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Self
 
 import torch
 
@@ -93,6 +94,36 @@ class Smoother(SplineOptions):
         kept = solved.factor if uncertainty or solver.starts_from_neighbour else None
         return problem.field(solved.solution, kept, own_factor=start is None)
 
+    def choose(
+        self,
+        points: torch.Tensor,
+        velocity: torch.Tensor,
+        weight: torch.Tensor | None = None,
+        wall: WallRows | None = None,
+        *,
+        divergence_points: torch.Tensor | None = None,
+        box: tuple[Sequence[float], Sequence[float]] | None = None,
+    ) -> Choice | None:
+        """What :meth:`fit` would choose from these samples, without the fit itself.
+
+        Args:
+            points: as in :meth:`fit`.
+            velocity: as in :meth:`fit`.
+            weight: as in :meth:`fit`.
+            wall: as in :meth:`fit`.
+            divergence_points: as in :meth:`fit`.
+            box: as in :meth:`fit`.
+
+        Returns:
+            The choice, to be given to fits of other frames; None with fixed options and where there is nothing to
+            choose from.
+
+        Raises:
+            InvalidInput: an argument breaks one of its rules.
+        """
+        data = FitData.checked(points, velocity, weight, wall, divergence_points, box, self.power)
+        return self._grid_and_choice(data)[2]
+
     def fit_many(
         self,
         points: torch.Tensor,
@@ -141,7 +172,16 @@ class Smoother(SplineOptions):
 
     def _problem(self, data: FitData, choice: Choice | None = None) -> Problem:
         """The assembled fit; with another frame's ``choice``, noise, curvature and slip are that frame's."""
-        given = choice
+        knots, options, found = self._grid_and_choice(data, choice)
+        if choice is not None:
+            return options._following(knots, data, choice)
+        if found is None:
+            return Problem(data, build_system(options.fixed(), knots, data), None)
+        return options._with_choice(knots, data, found)
+
+    def _grid_and_choice(self, data: FitData, given: Choice | None = None) -> tuple[Knots, Self, Choice | None]:
+        """Knots, the options in their lengths, and the choice made on them; a given one stays."""
+        choice = given
         for per_knot in (SAMPLES_PER_KNOT, SAMPLES_OF_LOW_NOISE):
             knots = knots_for(data, self, per_knot)
             options = self.for_knots(knots.spacing, data.components)
@@ -149,9 +189,7 @@ class Smoother(SplineOptions):
                 choice = choose(options, knots, data) if self.automatic else None
             if self.knots != BY_DATA or choice is None or not _low_noise(choice, data):
                 break
-        if choice is None:
-            return Problem(data, build_system(options.fixed(), knots, data), None)
-        return options._with_choice(knots, data, choice) if given is None else options._following(knots, data, given)
+        return knots, options, choice
 
     def _following(self, knots: Knots, data: FitData, choice: Choice) -> Problem:
         """The problem with another frame's noise, curvature and slip, and this frame's own outliers."""

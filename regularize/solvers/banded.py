@@ -1,5 +1,7 @@
 """Small algebra on lower band storage (n, width): row j holds entries (j, j), (j + 1, j), ..."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 from scipy.linalg.blas import dsbmv
@@ -36,6 +38,14 @@ def widen(scalar: torch.Tensor, scale: torch.Tensor) -> torch.Tensor:
     for k in range(c):
         out[:, k, ::c] = scale[k] * scalar
     return out.view(n * c, width * c)
+
+
+def add_widened(band: torch.Tensor, scalars: Sequence[torch.Tensor]) -> None:
+    """Add to the band of C components (n C, width C) scalar bands (n, width), the k-th to component k."""
+    n, width = scalars[0].shape
+    view = band.view(n, len(scalars), width, len(scalars))
+    for k, scalar in enumerate(scalars):
+        view[:, k, :, 0] += scalar
 
 
 def multiply(band: torch.Tensor, x: torch.Tensor) -> torch.Tensor:

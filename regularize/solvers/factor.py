@@ -60,10 +60,14 @@ class Factor:
 
     def sample(self, precision: float, generator: torch.Generator) -> torch.Tensor:
         """(active, C) Gaussian draw of mean 0 with ``precision`` times the factored matrix as precision."""
-        white = torch.randn(len(self.band), 1, generator=generator, dtype=torch.float64)
+        return self.samples(precision, 1, generator)[..., 0]
+
+    def samples(self, precision: float, count: int, generator: torch.Generator) -> torch.Tensor:
+        """(active, C, count) draws as of :meth:`sample` one after the other, by one pass over the factor."""
+        sides = (torch.randn(len(self.band), 1, generator=generator, dtype=torch.float64) for _ in range(count))
         # L' x = z gives x the covariance (L L')^-1
-        draw = self._algebra.solve(self.band, self.reach, white, lower=False, upper=True)
-        return draw.view(len(self.ordering.nodes), -1) / precision**0.5
+        draws = self._algebra.solve(self.band, self.reach, torch.cat(list(sides), 1), lower=False, upper=True)
+        return draws.view(len(self.ordering.nodes), -1, count) / precision**0.5
 
     @property
     def size(self) -> int:

@@ -16,12 +16,15 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from scipy.optimize import minimize_scalar
-from scipy.sparse import csr_array
+from scipy.sparse import coo_array
 from scipy.spatial import cKDTree
 
 from regularize.rows.operators import System, VectorRows
 from regularize.rows.ordering import Ordering
+from regularize.rows.sparse import value_matrix
 from regularize.solvers.factor import Factor
+
+from .waves import Lattice
 
 CENTRES = 500  # samples whose neighbours are looked at
 REACH = 6.0  # typical distances between samples over which correlation is looked for
@@ -50,50 +53,54 @@ class _Pairs:
     def __init__(self, points: np.ndarray, used: np.ndarray) -> None:
         # drawn from all samples: one that is discarded more or less does not change all the others
         drawn = np.random.default_rng(0).permutation(len(points))
-        centres = (np.cumsum(used) - 1)[drawn[used[drawn]][:CENTRES]]
+        self.centres = centres = (np.cumsum(used) - 1)[drawn[used[drawn]][:CENTRES]]
         points = points[used]
         tree = cKDTree(points)
         typical = float(np.median(tree.query(points[centres], k=2)[0][:, 1]))
         self.far = REACH * max(typical, 1e-12)
-        near = tree.query_ball_point(points[centres], self.far)
-        first = np.repeat(centres, [len(each) for each in near])
+        near = tree.query_ball_point(points[centres], self.far, return_sorted=False)
+        number = np.repeat(np.arange(len(centres)), [len(each) for each in near])
         second = np.concatenate([np.asarray(each, int) for each in near])
-        self.first, self.second = first[first != second], second[first != second]
-        distance = np.linalg.norm(points[self.first] - points[self.second], axis=1)
-        self.place = np.minimum(distance / self.far * BINS, BINS - 1).astype(int)
-        self.count = np.bincount(self.place, minlength=BINS)
-        self.middle = np.bincount(self.place, distance, BINS) / np.maximum(self.count, 1)
+        other = second != centres[number]
+        number, second = number[other], second[other]
+        distance = np.linalg.norm(points[centres[number]] - points[second], axis=1)
+        place = np.minimum(distance / self.far * BINS, BINS - 1).astype(int)
+        self.count = np.bincount(place, minlength=BINS)
+        self.middle = np.bincount(place, distance, BINS) / np.maximum(self.count, 1)
+        # sums over the neighbours of each centre in each bin: in single precision, half of the memory to gather from
+        shape = (len(centres) * BINS, len(points))
+        self.sums = coo_array((np.ones(len(second), np.float32), (number * BINS + place, second)), shape=shape).tocsr()
 
     def correlation(self, residual: torch.Tensor) -> Correlation:
         """What residuals (n, C, draws) have in common in each component."""
         far = FAR * 1.4826 * residual.abs().median(dim=0).values.mean(-1)[:, None]
         cut = torch.maximum(torch.minimum(residual, far), -far)
-        deviation, fits = cut.square().mean((0, 2)).sqrt(), []
-        for k in range(len(deviation)):
-            e = (cut[:, k] / deviation[k]).float().numpy()  # half of the memory to gather pairs from
-            together = np.einsum("pd,pd->p", e[self.first], e[self.second]) / e.shape[1]
-            fits.append(self._gaussian(np.bincount(self.place, together, BINS) / np.maximum(self.count, 1)))
+        deviation = cut.square().mean((0, 2)).sqrt()
+        e = (cut / deviation[:, None]).float().numpy()
+        near = (self.sums @ e.reshape(len(e), -1)).reshape(len(self.centres), BINS, *e.shape[1:])
+        together = np.einsum("ibcd,icd->cb", near.astype(np.float64), e[self.centres]) / e.shape[2]
+        fits = [self._gaussian(each / np.maximum(self.count, 1)) for each in together]
         share, length = torch.tensor(fits, dtype=torch.float64).unbind(1)
         return Correlation(deviation, share, length)
 
     def _gaussian(self, correlation: np.ndarray) -> tuple[float, float]:
         """Share in [0, 1] and length of share exp(-distance^2 / (2 length^2)), by least squares."""
 
-        def share(length: float) -> tuple[float, np.ndarray]:
+        def share(length: float | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             curve = np.exp(-0.5 * (self.middle / length) ** 2)
-            best = (self.count * curve * correlation).sum() / max((self.count * curve**2).sum(), 1e-300)
-            return float(np.clip(best, 0.0, 1.0)), curve
+            best = (curve * (self.count * correlation)).sum(-1) / np.maximum((self.count * curve**2).sum(-1), 1e-300)
+            return best.clip(0.0, 1.0), curve
 
-        def misfit(logarithm: float) -> float:
+        def misfit(logarithm: float | np.ndarray) -> np.ndarray:
             part, curve = share(np.exp(logarithm))
-            return float((self.count * (correlation - part * curve) ** 2).sum())
+            return np.asarray(self.count * (correlation - part[..., None] * curve) ** 2).sum(-1)
 
         grid = np.log(self.far) + np.linspace(np.log(SHORTEST), 0.0, 30)
-        place = int(np.argmin([misfit(each) for each in grid]))
+        place = int(np.argmin(misfit(grid[:, None])))
         # between the grid's points, so that the answer follows the data without jumps
         bounds = grid[max(place - 1, 0)], grid[min(place + 1, len(grid) - 1)]
         length = float(np.exp(minimize_scalar(misfit, bounds=bounds, method="bounded", options={"xatol": 1e-6}).x))
-        return share(length)[0], length
+        return float(share(length)[0]), length
 
 
 class CorrelatedErrors:
@@ -110,10 +117,11 @@ class CorrelatedErrors:
         if not isinstance(fit, VectorRows):
             raise TypeError(f"correlated errors are those of full vectors, not of {type(fit).__name__}")
         self.fit = fit
-        self.matrix = _matrix(fit, ordering)
+        self.matrix = value_matrix(fit, ordering)
         self.adjoint = self.matrix.T.tocsr()
         self.weight = weight[:, None, None]
         self.points = torch.tensor(self.fit.knots.spacing) * (self.fit.cell + self.fit.t)
+        self.lattice = Lattice(self.points)
         generator = torch.Generator().manual_seed(0)  # the same data give the same deviations
         shape = (system.components, WAVES, DRAWS)
         self.white = torch.randn(len(self.fit), system.components, DRAWS, generator=generator, dtype=torch.float64)
@@ -143,19 +151,16 @@ class CorrelatedErrors:
     def _spread(self, fitted: torch.Tensor) -> torch.Tensor:
         """Deviations with the fitted errors given, over those with the white ones that the posterior stands for."""
         white = self._fitted(self._pulled(self.white / self.precision**0.5))  # the draws in the errors: chance cancels
-        draws = [self.factor.sample(self.precision, self.generator) for _ in range(DRAWS)]
-        posterior = self._at_samples(torch.stack(draws, dim=-1))
+        posterior = self._at_samples(self.factor.samples(self.precision, DRAWS, self.generator))
         more = fitted.square().mean((0, 2)) - white.square().mean((0, 2))
         return (1.0 + more.clamp(min=0.0) / posterior.square().mean((0, 2))).sqrt()
 
     def _field(self, errors: Correlation) -> torch.Tensor:
         """(n, C, DRAWS) of variance 1: white, and plane waves with the spectrum of the correlated part."""
-        share, smooth, points = errors.share[:, None], torch.empty_like(self.white), self.points.float()
+        share, smooth = errors.share[:, None], torch.empty_like(self.white)
         for k in range(self.system.components):
-            waves = self.waves[:, k].flatten(1) / float(errors.length[k])
-            phases = torch.addmm(self.phase[k].flatten(), points, waves)
-            smooth[:, k] = phases.cos_().view(-1, WAVES, DRAWS).sum(1) * (2 / WAVES) ** 0.5
-        return share.sqrt() * smooth + (1 - share).sqrt() * self.white
+            smooth[:, k] = self.lattice.sum_of_waves(self.waves[:, k] / float(errors.length[k]), self.phase[k])
+        return share.sqrt() * smooth * (2 / WAVES) ** 0.5 + (1 - share).sqrt() * self.white
 
     def _pulled(self, rows: torch.Tensor) -> torch.Tensor:
         """Right-hand sides (active, C, DRAWS) in solve order of weighted sample values (n, C, DRAWS)."""
@@ -169,16 +174,6 @@ class CorrelatedErrors:
     def _at_samples(self, x: torch.Tensor) -> torch.Tensor:
         """Fields (n, C, DRAWS) at the samples of coefficients (active, C, DRAWS) in solve order."""
         return torch.from_numpy(self.matrix @ x.flatten(1).numpy()).view(-1, *x.shape[1:])
-
-
-def _matrix(fit: VectorRows, ordering: Ordering) -> csr_array:
-    """(n, active) values of the coefficients' functions, in solve order, at the samples."""
-    nodes, values = fit.knots.local_nodes(fit.cell), fit.rows_at(slice(None)).double()
-    place = torch.empty(fit.knots.nodes, dtype=torch.int64)
-    place[ordering.nodes] = torch.arange(len(ordering.nodes))
-    starts = np.arange(0, nodes.numel() + 1, nodes.shape[1])
-    shape = (len(nodes), len(ordering.nodes))
-    return csr_array((values.flatten().numpy(), place[nodes].flatten().numpy(), starts), shape=shape)
 
 
 def _towards(errors: Correlation, seen: Correlation, left: Correlation) -> Correlation:

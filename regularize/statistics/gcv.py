@@ -13,7 +13,8 @@ from scipy.optimize import minimize_scalar
 from regularize.solvers.banded import widen
 from regularize.solvers.factor import Factor
 
-from .likelihood import PROBES, SHARPEST, Choice, LikelihoodSearch, Precisions
+from .likelihood import SHARPEST, Choice, LikelihoodSearch, Precisions
+from .row_groups import PROBES
 
 
 def cross_validate(search: LikelihoodSearch, no_slip: float | None, rounds: int) -> Choice:

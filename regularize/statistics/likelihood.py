@@ -14,29 +14,30 @@ finer scales, which tells nothing about them, drops out.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from math import exp, log
 from typing import NamedTuple
 
 import torch
 
 from regularize.basis.knots import Knots
-from regularize.rows.operators import CellRows, DivergenceRows, RowBlock, System, VectorRows
-from regularize.rows.ordering import Ordering, order
-from regularize.solvers.banded import multiply, widen
+from regularize.rows.operators import System, VectorRows
+from regularize.rows.ordering import order
+from regularize.solvers.banded import add_widened
 from regularize.solvers.factor import Factor
 from regularize.solvers.prepared import SHIFT, PreparedSystem
 
+from .extrapolation import Extrapolation
 from .robust import inflation, robust_weight
+from .row_groups import PROBES, Alike, Coupled, Groups, Samples, random_sums
 
 LEAST, MOST = 1e-30, 1e30  # of a strength: its tenth power is still a number
 
-PROBES = 8  # random sums of rows per trace: its error is about sqrt(2 / (PROBES unknowns)), near 1 %
 RELAXATION = 1.6  # the plain update converges from one side at a rate near 0.6
 UNLIKE = 10.0  # no component is taken for more than this many times noisier than another
 MOST_PER_ROUND = 1e3  # growth of a precision, where a penalty's energy vanishes
-SHRINKING = (0.3, 0.85)  # ratios of successive steps between which their sum is foretold
-SETTLED = 0.03  # a round that changes no precision by more than this fraction ends the search
+FEWEST_ROUNDS = 3  # with fewer a small step may be chance
+SETTLED = 0.1  # a round that moves no precision by more than this fraction, nor is foretold to, ends the search
 FLOOR = 1e-3  # slip precisions below this share of the data's no longer matter
+LEAST_OF_SLIP = 0.1  # by so much may a foretold slip be less than the round's
 NOISE_FLOOR = 1e-4  # of the data's root mean square: exact data would send the precision to infinity
 SHARPEST = 0.01  # curvature lengths stay between this many knot spacings and its inverse
 LONGEST = 10.0  # divergence lengths stay below so many sides of the box: divergence-free data want an infinite one
@@ -107,21 +108,6 @@ class Start:
     robust: torch.Tensor | None = None  # (n,) factors on the squared rows of the samples; None: all 1
 
 
-@dataclass(frozen=True)
-class Groups:
-    """Rows on the search grid. Penalties are means over the fluid or the wall, as in the Smoother's cost."""
-
-    order: int  # of the derivatives that the curvature rows hold
-    points: torch.Tensor  # (n, D) m
-    velocity: torch.Tensor  # (n, C) m/s
-    weight: torch.Tensor  # (n,) row weights
-    curvature: CellRows  # one component
-    slip: VectorRows | None  # the wall rows held in full, one weight per row
-    divergence: DivergenceRows | CellRows | None  # only where its strength is to be chosen
-    fixed: list[RowBlock]  # divergence and wall rows at the strength the options give
-    damping: float  # row factor
-
-
 class Precisions(NamedTuple):
     """What the search looks for: of the samples' components (C,), curvature, slip and divergence (0: no such rows)."""
 
@@ -130,62 +116,17 @@ class Precisions(NamedTuple):
     slip: float
     divergence: float
 
+    def logarithms(self, floor: float) -> torch.Tensor:
+        """(C + 3,), of slip as of its sum with ``floor``: what lies below no longer matters; 0 for absent rows."""
+        rest = torch.tensor([self.rough, self.slip and self.slip + floor, self.divergence], dtype=torch.float64)
+        return torch.cat([self.fit, torch.where(rest > 0, rest, 1.0)]).log()
 
-class _Coupled:
-    """A group of rows without targets that couple the components."""
-
-    def __init__(self, block: DivergenceRows | CellRows, ordering: Ordering) -> None:
-        self.block, self.ordering = block, ordering
-        self.band = PreparedSystem(System(ordering.knots, block.components, [block], 0.0), ordering).band()
-
-    def probes(self, generator: torch.Generator) -> torch.Tensor:
-        """As :meth:`_Alike.probes`."""
-        draws = []
-        for _ in range(PROBES):
-            signs = torch.randint(0, 2, self.block.target.shape, generator=generator).double() * 2 - 1
-            draws.append(self.block.rmatvec(signs)[self.ordering.nodes])
-        return torch.stack(draws, dim=-1)
-
-    def energy(self, x: torch.Tensor) -> float:
-        """Sum of the squared rows at x (active, C)."""
-        flat = x.reshape(-1, 1)
-        return float((flat * multiply(self.band, flat)).sum())
-
-
-class _Alike:
-    """A group that acts alike on every component: one scalar band serves them all."""
-
-    def __init__(self, block: VectorRows | CellRows, ordering: Ordering) -> None:
-        knots, self.block, self.ordering = ordering.knots, block, ordering
-        if isinstance(block, CellRows):
-            self.band = PreparedSystem(System(knots, 1, [block], 0.0), ordering).band()
-            self.right, self.size = torch.zeros(()), 0.0
-            return
-        one = block.component(0)
-        self.band = PreparedSystem(System(knots, 1, [one], 0.0), ordering).band()
-        self.right = PreparedSystem(System(knots, block.components, [block], 0.0), ordering).gradient()
-        self.size = float(block.target.square().sum())
-
-    def times(self, x: torch.Tensor) -> torch.Tensor:
-        """Normal matrix times x (active, ...)."""
-        return multiply(self.band, x.reshape(len(x), -1)).view(x.shape)
-
-    def probes(self, components: int, generator: torch.Generator) -> torch.Tensor:
-        """(active, C, PROBES) draws u with E[u u'] = the group's normal matrix: its rows' random sums.
-
-        tr(M^-1 G) = E[u' M^-1 u] has a small variance where M holds G; with signs on the coefficients,
-        directions that M hardly knows would drown it.
-        """
-        width = components * PROBES
-        rows = self.block.repeated(width)
-        signs = torch.randint(0, 2, rows.target.shape, generator=generator).double() * 2 - 1
-        summed = rows.rmatvec(signs)[self.ordering.nodes]
-        return summed.view(-1, components, PROBES)
-
-    def energy(self, x: torch.Tensor) -> float:
-        """Sum of the squared row residuals at x (active, C)."""
-        linear = 0.0 if isinstance(self.right, float) else float((x * self.right).sum())
-        return float((x * self.times(x)).sum()) - 2.0 * linear + self.size
+    def at(self, logarithms: torch.Tensor, floor: float) -> "Precisions":
+        """The same rows at other logarithms."""
+        values = logarithms.exp()
+        rough, slip, free = values[len(self.fit) :].tolist()
+        slip = max(slip - floor, LEAST_OF_SLIP * self.slip)
+        return Precisions(values[: len(self.fit)], rough, slip if self.slip else 0.0, free if self.divergence else 0.0)
 
 
 class LikelihoodSearch:
@@ -196,21 +137,22 @@ class LikelihoodSearch:
         fit = VectorRows(knots, groups.points, groups.velocity, groups.weight[:, None])
         every = [fit, *groups.fixed, *(rows for rows in (groups.slip, groups.divergence) if rows is not None)]
         self.ordering = order(System(knots, self.components, every, 0.0))
-        self.fit, self.step = fit, max(knots.spacing[: self.components])  # m, time left out
-        self.curvature = _Alike(groups.curvature, self.ordering)
-        self.slip = None if groups.slip is None else _Alike(groups.slip, self.ordering)
-        self.divergence = None if groups.divergence is None else _Coupled(groups.divergence, self.ordering)
+        self.samples, self.step = Samples(fit, self.ordering), max(knots.spacing[: self.components])  # m, time left out
+        self.curvature = Alike.of(groups.curvature, self.ordering)
+        self.slip = None if groups.slip is None else Alike.of(groups.slip, self.ordering)
+        self.divergence = None if groups.divergence is None else Coupled(groups.divergence, self.ordering)
         silent = VectorRows(knots, groups.points, groups.velocity, torch.zeros_like(groups.weight)[:, None])
         fixed = PreparedSystem(System(knots, self.components, [silent, *groups.fixed], groups.damping), self.ordering)
         self.fixed, self.fixed_right = fixed.band(), fixed.gradient()
         generator = torch.Generator().manual_seed(0)  # fixed probes: the same data give the same choice
         shape = (len(self.ordering.nodes), self.components * PROBES)
         self.signs = torch.randint(0, 2, shape, generator=generator).double() * 2 - 1
-        self.rough_probes = self.curvature.probes(self.components, generator)
-        if self.slip is not None:
-            self.slip_probes = self.slip.probes(self.components, generator)
+        self.rough_probes = random_sums(groups.curvature, self.ordering, self.components, generator)
+        if groups.slip is not None:
+            self.slip_probes = random_sums(groups.slip, self.ordering, self.components, generator)
         if self.divergence is not None:
             self.divergence_probes = self.divergence.probes(generator)
+        self.ahead = Extrapolation()
         self._weigh(torch.ones_like(groups.weight))
         speed = float(groups.velocity.double().square().mean().sqrt())
         self.sharpest = (NOISE_FLOOR * speed) ** -2
@@ -225,15 +167,15 @@ class LikelihoodSearch:
         slip = 0.0 if self.slip is None or start.no_slip is None else scale * start.no_slip**2
         free = 0.0 if self.divergence is None or start.divergence is None else scale * start.divergence**2
         found, settled, count = Precisions(fit, self.roughness(scale, start.curvature), slip, free), False, 0
-        steps: list[float] = []
+        floor = FLOOR * scale
         while count < rounds and not settled:
             count += 1
-            old, found = found, self._round(found)
-            settled = self._settled(old, found)
-            steps.append(log(found.rough / old.rough))
-            ahead = 0.0 if settled else _still_to_come(steps)
-            if ahead:
-                found, steps = found._replace(rough=found.rough * exp(ahead)), []
+            mapped = self._round(found)
+            before, after = (each.logarithms(floor) for each in (found, mapped))
+            ahead = self.ahead.next(before, after)
+            found = mapped.at(ahead, floor)
+            moved = float(torch.stack([after - before, ahead - before]).abs().max())
+            settled = count >= FEWEST_ROUNDS and moved < SETTLED
         scale = self.scale(found.fit)
         noise_each = tuple((found.fit**-0.5).tolist())
         no_slip, divergence = (_strength(each / scale) for each in (found.slip, found.divergence))
@@ -242,7 +184,9 @@ class LikelihoodSearch:
 
     def _round(self, now: Precisions) -> Precisions:
         band, right = self.prior(now)
-        posterior = Factor(band + widen(self.data.band, now.fit), self.ordering)
+        both = band.clone()
+        add_widened(both, [precision * self.data.band for precision in now.fit.tolist()])
+        posterior = Factor(both, self.ordering)
         prior = Factor(band, self.ordering)
         penalties = self._penalty_probes(now)
         # all right-hand sides at once: each alone would fetch the whole factor from memory
@@ -275,12 +219,13 @@ class LikelihoodSearch:
 
     def prior(self, now: Precisions) -> tuple[torch.Tensor, torch.Tensor]:
         """Band and right-hand side of all penalties."""
-        scale, one = self.scale(now.fit), torch.ones(self.components, dtype=torch.float64)
-        prior = scale * self.fixed + widen(self.curvature.band, now.rough * one)
+        scale, alike = self.scale(now.fit), now.rough * self.curvature.band
         right = scale * self.fixed_right
         if self.slip is not None and now.slip > 0:
-            prior += widen(self.slip.band, now.slip * one)
+            alike.add_(self.slip.band, alpha=now.slip)
             right = right + now.slip * self.slip.right
+        prior = scale * self.fixed
+        add_widened(prior, [alike] * self.components)
         if self.divergence is not None and now.divergence > 0:
             prior.add_(self.divergence.band, alpha=now.divergence)
         # stiff penalties over a breath of damping may lose definiteness to round-off
@@ -318,17 +263,13 @@ class LikelihoodSearch:
 
     def reweigh(self, x: torch.Tensor) -> None:
         """Judge the samples anew by their distance from the fit with coefficients x (active, C)."""
-        fitted = self.fit.matvec(self.ordering.expand(x)).view(-1, self.components)
-        residual = self.groups.velocity - fitted / self.groups.weight[:, None]
         if self.robust is not None:
-            self._weigh(robust_weight(residual, self.robust))
+            self._weigh(robust_weight(self.groups.velocity - self.samples.at(x), self.robust))
 
     def _weigh(self, factor: torch.Tensor) -> None:
         """Take robust factors (n,) into the data group and its unpenalised fit."""
-        self.factor = factor
+        self.factor, self.data = factor, self.samples.weighed(factor.double())
         weight = self.groups.weight * factor.sqrt()
-        rows = VectorRows(self.fit.knots, self.groups.points, self.groups.velocity, weight[:, None])
-        self.data = _Alike(rows, self.ordering)
         ridge = self.roughness(float(weight.double().square().sum()), RIDGE * self.step)
         ridged = Factor(self.data.band + ridge * self.curvature.band, self.ordering)
         self.unpenalised = ridged.solve(self.data.right[:, None]).squeeze(1)
@@ -341,22 +282,6 @@ class LikelihoodSearch:
     def unknowns(self) -> int:
         """Of one of its systems."""
         return self.components * len(self.ordering.nodes)
-
-    def _settled(self, old: Precisions, new: Precisions) -> bool:
-        fit = float(((new.fit - old.fit) / old.fit).abs().max())
-        rough = abs(new.rough / old.rough - 1.0)
-        slip = abs(new.slip - old.slip) / (old.slip + FLOOR * self.scale(old.fit))
-        free = abs(new.divergence - old.divergence) / (old.divergence + 1e-300)
-        return max(fit, rough, slip, free) < SETTLED
-
-
-def _still_to_come(steps: list[float]) -> float:
-    """What steps that shrink by the same ratio will add up to from here on; 0 where the last two do not shrink so.
-
-    Aitken's extrapolation; the smoothness creeps towards its end for many rounds by two thirds of the step before.
-    """
-    ratio = steps[-1] / steps[-2] if len(steps) > 1 and steps[-2] else 0.0
-    return steps[-1] * ratio / (1.0 - ratio) if SHRINKING[0] < ratio < SHRINKING[1] else 0.0
 
 
 def _solved(factor: Factor, right: list[torch.Tensor]) -> list[torch.Tensor]:

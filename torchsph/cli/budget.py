@@ -15,6 +15,7 @@ from torchsph.methods.runtime.parallel import under_torchrun
 from .arguments import AUTO
 from .outputs import write_json
 from .printing import say
+from .running.small_files import read_small
 
 # beside the checkpoint of a run that chose its spacing, which goes on with the same
 NAME = "spacing.json"
@@ -43,7 +44,7 @@ def chosen_spacing(
         raise ValueError("--budget is for one machine: give --spacing under torchrun")
     found: dict[str, Any]
     if kept is not None and kept.is_file():
-        found = json.loads(kept.read_text(encoding="utf-8"))
+        found = _kept(kept)
     else:
         found = asdict(choose(args.budget))
         found["trials"] = [{"spacing": one, "seconds": seconds} for one, seconds in found["trials"].items()]
@@ -54,4 +55,20 @@ def chosen_spacing(
     say(
         f"particles of {1e3 * found['spacing']:.3g} mm: about {found['seconds']:.3g} s of the {found['budget']:g} given"
     )
+    return found
+
+
+def _kept(path: Path) -> dict[str, Any]:
+    """The choice of the run that this one goes on with.
+
+    Raises:
+        ValueError: the file does not say it.
+    """
+    content = read_small(path)
+    try:
+        found = dict(json.loads(content))
+        for name in ("spacing", "seconds", "budget"):
+            found[name] = float(found[name])
+    except (ValueError, TypeError, KeyError, RecursionError) as fault:
+        raise ValueError(f"{path}: does not say which spacing was chosen; remove it to choose again") from fault
     return found

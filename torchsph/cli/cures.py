@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from .exit_codes import ExitCode
@@ -37,6 +39,21 @@ def late_fault(fault: BaseException, code: ExitCode, args: argparse.Namespace | 
     if code is ExitCode.INPUT and isinstance(fault, ValueError) and not _names_what_was_given(str(fault), args):
         return f"{_about(args)}{fault}"
     return None
+
+
+@contextmanager
+def about(name: str) -> Iterator[None]:
+    """Faults of a second input are told by its name, not by that of the command's first.
+
+    Raises:
+        ValueError: what was raised within, opened by the name.
+    """
+    try:
+        yield
+    except ValueError as fault:
+        if name in str(fault):
+            raise
+        raise ValueError(f"{name}: {fault}") from fault
 
 
 def _names_what_was_given(text: str, args: argparse.Namespace | None) -> bool:

@@ -90,10 +90,18 @@ class QuantityTables:
             # what is quadratic in the velocity is too small in the analysis itself: its best value is the members' mean
             made = cls(recording.time, kind, {"analysis": members.estimate}, members.bands(), members.beat_bands())
         if truth is not None:
-            if (truth.dimension, truth.cut) != (recording.dimension, recording.cut):
-                raise ValueError("the truth and the analysis must both be of space, of a plane flow, or of a cut plane")
-            made.curves["truth"] = plain_curves(truth.select(matching_frames(recording.time, truth.time, "the truth")))
+            made.compare(truth)
         return made
+
+    def compare(self, truth: geometry.Recording) -> None:
+        """Add the truth's frames at the analysis's times.
+
+        Raises:
+            ValueError: it is of another kind, or has no frame at one of them.
+        """
+        if catalogue(truth.dimension, truth.cut) != self.kind:
+            raise ValueError("the truth and the analysis must both be of space, of a plane flow, or of a cut plane")
+        self.curves["truth"] = plain_curves(truth.select(matching_frames(self.time, truth.time, "the truth")))
 
     @property
     def beat(self) -> dict[str, Curves]:

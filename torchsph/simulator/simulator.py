@@ -91,6 +91,8 @@ class Simulator:
     def resume(self, particles: Particles, time: float) -> Simulation:
         """Run on with particles in internal units that were made elsewhere.
 
+        A member with numbers that are not finite has failed, as one that a run lost: the others go on.
+
         Raises:
             TypeError: arrays that are no tensors, or of another type than the simulator's.
             ValueError: arrays that disagree in length, dimension or device; values that no run can step.

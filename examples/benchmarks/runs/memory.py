@@ -1,6 +1,6 @@
 """Predicted against measured memory of whole runs, each in a process of its own.
 
-    python examples/benchmarks/runs/memory.py [--quick] [N ...]
+    python examples/benchmarks/runs/memory.py [--quick] [--out memory.json] [N ...]
 
 Prints, for each scene, what `torchsph.methods.memory` predicts beyond the process at its start, the peak of resident
 memory that the run then added to it, their ratio, and the ratio of the whole processes' peaks. What reading the
@@ -98,14 +98,16 @@ def main() -> None:
     """Run the scenes, or those of the numbers given, one after another and print the table."""
     parser = argparse.ArgumentParser(description=str(__doc__).splitlines()[0])
     parser.add_argument("scenes", nargs="*", type=int, metavar="N", help="numbers of scenes, from 0 (all)")
+    parser.add_argument("--out", type=Path, help="the rows, JSON")
     parser.add_argument("--quick", action="store_true", help="the first four, on the sample")
     parser.add_argument("--scene", type=int, help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.scene is not None:
         print(json.dumps(run(*SCENES[args.scene])))
         return
-    sizes = f"{'predicted MB':>12} {'measured MB':>11} ratio  whole"
-    print(f"{'run':8} {'scene':8} {'frames':>6} {'spacing':>8} {'members':>7} {sizes}")
+    heads = f"{'predicted MB':>12} {'measured MB':>11} ratio  whole"
+    print(f"{'run':8} {'scene':8} {'frames':>6} {'spacing':>8} {'members':>7} {heads}")
+    rows = []
     for number in args.scenes or range(4 if args.quick else len(SCENES)):
         call = [sys.executable, "-W", "ignore", __file__, "--scene", str(number)]
         found = json.loads(subprocess.run(call, check=True, capture_output=True, text=True).stdout.splitlines()[-1])
@@ -114,6 +116,11 @@ def main() -> None:
         whole = (found["start"] + found["predicted"]) / (found["start"] + found["measured"])
         told = f"{method:8} {name:8} {frames:6} {spacing or '-':>8} {members:7} {found['predicted'] / 1e6:12.0f}"
         print(f"{told} {found['measured'] / 1e6:11.0f} {ratio:5.2f}  {whole:5.2f}", flush=True)
+        about = {"run": method, "scene": name, "frames": frames, "spacing": spacing, "members": members}
+        sizes = {f"{part}_MB": round(found[part] / 1e6, 1) for part in ("predicted", "measured")}
+        rows.append({**about, **sizes, "ratio": round(ratio, 3), "whole": round(whole, 3)})
+    if args.out:
+        args.out.write_text(json.dumps(rows, indent=1), encoding="utf-8")
 
 
 if __name__ == "__main__":

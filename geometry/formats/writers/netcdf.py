@@ -6,7 +6,7 @@ import errno
 from pathlib import Path
 
 from geometry.formats.labelled_arrays import to_xarray
-from geometry.formats.own_mark import MARK
+from geometry.formats.own.mark import MARK
 from geometry.recordings.recording import Recording
 
 

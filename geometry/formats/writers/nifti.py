@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from geometry.formats.own_mark import MARK, marked
+from geometry.formats.own.mark import MARK, marked
 from geometry.formats.source import missing_extra
 from geometry.recordings.recording import Recording
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from geometry.formats.own_mark import FIELDS, MARK, marked
+from geometry.formats.own.mark import FIELDS, MARK, marked
 from geometry.recordings.recording import Recording
 
 

@@ -11,7 +11,7 @@ import h5py
 import numpy as np
 
 from geometry.arguments import checked
-from geometry.formats.own_mark import SOURCE
+from geometry.formats.own.mark import SOURCE
 from geometry.recordings.read import read_recording
 from geometry.recordings.recording import Recording, Wall
 

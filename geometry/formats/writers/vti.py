@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from geometry.formats.own_mark import MARK, marked
+from geometry.formats.own.mark import MARK, marked
 from geometry.formats.source import missing_extra
 from geometry.recordings.recording import Recording
 

@@ -14,7 +14,7 @@ from types import TracebackType
 import h5py
 import numpy as np
 
-from geometry.formats.own_mark import MARK, marked
+from geometry.formats.own.mark import MARK, marked
 from geometry.recordings.recording import Recording
 from geometry.recordings.whole_file import write_whole
 

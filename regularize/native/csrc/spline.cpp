@@ -126,90 +126,119 @@ void add_products(const double* p, const double* q, int depth, int padded, doubl
   }
 }
 
-// Gram blocks of one cell: pair[d][c][m][l] belongs to unknowns (m, d) and (l, c); shared is added for c == d.
+// Gram blocks of one cell. coupled (wide, wide): of unknowns l C + c; own (C, padded, padded): of one component alone;
+// shared (padded, padded): of every component.
 struct CellGram {
-  int components, padded;
-  std::vector<double> pair, shared, panel;  // the panels' padding stays 0
-  bool has_pairs[kMaxComponents][kMaxComponents];
-  bool has_shared;
+  int components, padded, wide;
+  std::vector<double> coupled, own, shared, panel, mixed;  // the panels' padding stays 0
+  std::vector<int> run;                                    // end of the run of neighbouring positions from each one on
+  bool has_coupled, has_shared, has_own[kMaxComponents];
 
-  CellGram(int components_, int padded_)
-      : components(components_), padded(padded_),
-        pair(size_t(components_) * components_ * padded_ * padded_), shared(size_t(padded_) * padded_),
-        panel(size_t(components_) * kDepth * padded_) {}
+  CellGram(int components_, int padded_, int local)
+      : components(components_), padded(padded_), wide((components_ * local + kCols - 1) / kCols * kCols),
+        coupled(size_t(wide) * wide), own(size_t(components_) * padded_ * padded_), shared(size_t(padded_) * padded_),
+        panel(size_t(components_) * kDepth * padded_), mixed(size_t(kDepth) * wide), run(local) {}
 
-  double* block(int d, int c) { return pair.data() + size_t(d * components + c) * padded * padded; }
   void clear() {
-    std::memset(has_pairs, 0, sizeof has_pairs);
-    has_shared = false;
+    std::memset(has_own, 0, sizeof has_own);
+    has_coupled = has_shared = false;
   }
-  double* touched(int d, int c) {
-    if (!has_pairs[d][c]) std::fill_n(block(d, c), size_t(padded) * padded, 0.0);
-    has_pairs[d][c] = true;
-    return block(d, c);
+  static double* touched(bool& has, double* block, int size) {
+    if (!has) std::fill_n(block, size_t(size) * size, 0.0);
+    has = true;
+    return block;
   }
-  double* touched_shared() {
-    if (!has_shared) std::fill(shared.begin(), shared.end(), 0.0);
-    has_shared = true;
-    return shared.data();
-  }
+  double* touched_coupled() { return touched(has_coupled, coupled.data(), wide); }
+  double* touched_shared() { return touched(has_shared, shared.data(), padded); }
+  double* touched_own(int c) { return touched(has_own[c], own.data() + size_t(c) * padded * padded, padded); }
 };
 
-void add_point_rows(const SplineGrid& g, const SplineRows& rows, int64_t begin, int64_t end, CellGram& cell) {
-  const int padded = cell.padded;
-  const size_t panel = size_t(kDepth) * padded;
-  const bool vector = rows.kind == kVector;
+void add_vector_rows(const SplineGrid& g, const SplineRows& rows, int64_t first, int depth, CellGram& cell) {
+  const size_t panel = size_t(kDepth) * cell.padded;
+  const int panels = rows.shared ? 1 : g.components;
+  for (int k = 0; k < depth; ++k) {
+    const int64_t n = first + k;
+    const Basis basis(g, rows.t + n * g.axes, false);
+    for (int c = 0; c < panels; ++c) {
+      double* row = cell.panel.data() + c * panel + size_t(k) * cell.padded;
+      stencil(g, basis, -1, rows.coefficient[n * g.components + c], row);
+    }
+  }
+  for (int c = 0; c < panels; ++c) {
+    const double* p = cell.panel.data() + c * panel;
+    add_products(p, p, depth, cell.padded, rows.shared ? cell.touched_shared() : cell.touched_own(c));
+  }
+}
+
+void add_coupled_rows(const SplineGrid& g, const SplineRows& rows, int64_t first, int depth, int local,
+                      CellGram& cell) {
+  for (int k = 0; k < depth; ++k) {
+    const int64_t n = first + k;
+    const Basis basis(g, rows.t + n * g.axes, rows.kind == kDivergence);
+    double* row = cell.mixed.data() + size_t(k) * cell.wide;
+    for (int c = 0; c < g.components; ++c) {
+      row_of(g, rows, basis, n, c, cell.panel.data());
+      for (int l = 0; l < local; ++l) row[l * g.components + c] = cell.panel[l];
+    }
+  }
+  add_products(cell.mixed.data(), cell.mixed.data(), depth, cell.wide, cell.touched_coupled());
+}
+
+void add_point_rows(const SplineGrid& g, const SplineRows& rows, int64_t begin, int64_t end, int local,
+                    CellGram& cell) {
   for (int64_t first = begin; first < end; first += kDepth) {
     const int depth = int(std::min<int64_t>(kDepth, end - first));
-    const int panels = vector && rows.shared ? 1 : g.components;
-    for (int k = 0; k < depth; ++k) {
-      const int64_t n = first + k;
-      const Basis basis(g, rows.t + n * g.axes, rows.kind == kDivergence);
-      for (int c = 0; c < panels; ++c) {
-        double* row = cell.panel.data() + c * panel + size_t(k) * padded;
-        if (vector) stencil(g, basis, -1, rows.coefficient[n * g.components + c], row);
-        else row_of(g, rows, basis, n, c, row);
-      }
-    }
-    const double* p = cell.panel.data();
-    if (vector && rows.shared) {
-      add_products(p, p, depth, padded, cell.touched_shared());
-      continue;
-    }
-    for (int d = 0; d < g.components; ++d)
-      for (int c = 0; c < g.components; ++c)
-        if (!vector || c == d)
-          add_products(p + d * panel, p + c * panel, depth, padded, cell.touched(d, c));
+    if (rows.kind == kVector) add_vector_rows(g, rows, first, depth, cell);
+    else add_coupled_rows(g, rows, first, depth, local, cell);
   }
 }
 
 void add_constant(const SplineGrid& g, const SplineRows& rows, int local, CellGram& cell) {
-  auto add = [&](const double* from, double* to) {
+  const int c_count = g.components;
+  if (rows.kind == kCellScalar) {
+    double* to = cell.touched_shared();
     for (int m = 0; m < local; ++m)
-      for (int l = 0; l < local; ++l) to[m * cell.padded + l] += from[m * local + l];
-  };
-  if (rows.kind == kCellScalar) return add(rows.gram, cell.touched_shared());
-  for (int d = 0; d < g.components; ++d)
-    for (int c = 0; c < g.components; ++c)
-      add(rows.gram + size_t(d * g.components + c) * local * local, cell.touched(d, c));
+      for (int l = 0; l < local; ++l) to[m * cell.padded + l] += rows.gram[m * local + l];
+    return;
+  }
+  double* to = cell.touched_coupled();
+  for (int d = 0; d < c_count; ++d)
+    for (int c = 0; c < c_count; ++c) {
+      const double* from = rows.gram + size_t(d * c_count + c) * local * local;
+      for (int m = 0; m < local; ++m) {
+        double* row = to + size_t(m * c_count + d) * cell.wide + c;
+        for (int l = 0; l < local; ++l) row[l * c_count] += from[m * local + l];
+      }
+    }
 }
 
 // Add a cell's blocks to band[(column) * width + (row - column)], row >= column.
 void scatter(const SplineGrid& g, int64_t cell_number, int local, CellGram& cell, double* band, int64_t width) {
   const int32_t* position = g.position + cell_number * local;
   const int c_count = g.components, padded = cell.padded;
+  for (int l = local - 1; l >= 0; --l)
+    cell.run[l] = l + 1 < local && position[l + 1] == position[l] + 1 ? cell.run[l + 1] : l + 1;
   for (int m = 0; m < local; ++m) {
     for (int d = 0; d < c_count; ++d) {
       const int64_t column = int64_t(position[m]) * c_count + d;
       double* out = band + column * width - column;
-      for (int c = 0; c < c_count; ++c) {
-        const bool scalar = c == d && cell.has_shared;
-        if (!cell.has_pairs[d][c] && !scalar) continue;
-        const double* pair = cell.has_pairs[d][c] ? cell.block(d, c) + size_t(m) * padded : nullptr;
-        const double* shared = scalar ? cell.shared.data() + size_t(m) * padded : nullptr;
-        for (int l = c >= d ? m : m + 1; l < local; ++l)
-          out[int64_t(position[l]) * c_count + c] += (pair ? pair[l] : 0.0) + (shared ? shared[l] : 0.0);
+      if (cell.has_coupled) {
+        const double* row = cell.coupled.data() + size_t(m * c_count + d) * cell.wide;
+        double* diagonal = out + int64_t(position[m]) * c_count;
+        for (int c = d; c < c_count; ++c) diagonal[c] += row[m * c_count + c];
+        for (int l = m + 1; l < local; l = cell.run[l]) {
+          double* to = out + int64_t(position[l]) * c_count;
+          const double* from = row + l * c_count;
+          const int count = (cell.run[l] - l) * c_count;
+#pragma omp simd
+          for (int k = 0; k < count; ++k) to[k] += from[k];
+        }
       }
+      const double* own = cell.has_own[d] ? cell.own.data() + (size_t(d) * padded + m) * padded : nullptr;
+      const double* shared = cell.has_shared ? cell.shared.data() + size_t(m) * padded : nullptr;
+      if (!own && !shared) continue;
+      for (int l = m; l < local; ++l)
+        out[int64_t(position[l]) * c_count + d] += (own ? own[l] : 0.0) + (shared ? shared[l] : 0.0);
     }
   }
 }
@@ -286,7 +315,7 @@ void gram(const SplineGrid* grid, const SplineRows* blocks, int32_t block_count,
 #pragma omp parallel if (g.cells > kWorthThreads / 16)
     {
       std::optional<CellGram> room;
-      const bool ready = rescue.run([&] { room.emplace(g.components, g.padded); });
+      const bool ready = rescue.run([&] { room.emplace(g.components, g.padded, local); });
 #pragma omp for schedule(dynamic, 1)
       for (int64_t slab = parity; slab < slabs; slab += 2) {
         for (int64_t number = slab_start[slab]; ready && number < slab_start[slab + 1]; ++number) {
@@ -297,7 +326,7 @@ void gram(const SplineGrid* grid, const SplineRows* blocks, int32_t block_count,
             if (rows.kind >= kCellScalar) {
               if (rows.start[number + 1] > rows.start[number]) add_constant(g, rows, local, cell);
             } else {
-              add_point_rows(g, rows, rows.start[number], rows.start[number + 1], cell);
+              add_point_rows(g, rows, rows.start[number], rows.start[number + 1], local, cell);
             }
           }
           scatter(g, number, local, cell, band, width);

@@ -6,6 +6,8 @@ import torch
 from regularize_cases import smoother
 from scipy.ndimage import gaussian_filter
 
+from regularize.statistics.waves import Lattice
+
 PLAIN = smoother(correlated=False)  # the fit as for independent errors
 NODES, STEP = 16, 1e-3  # per axis, m
 LEVEL = (0.1, 0.1, 0.04)  # m/s
@@ -74,6 +76,17 @@ def test_shared_errors_weigh_less_in_the_fit():
         score.append(counted[-1] / field.std(grid())[INNER])
         assert min(field.choice.shared) > 1.2
     assert rms(counted) < 0.93 * rms(plain) and 0.7 < rms(score) < 1.4
+
+
+def test_waves_are_summed_by_axes_as_one_by_one():
+    generator = torch.Generator().manual_seed(0)
+    points = (grid() + 0.02)[torch.rand(NODES**3, generator=generator) < 0.6]
+    waves, phase = 500 * torch.randn(3, 5, 2, generator=generator), torch.rand(5, 2, generator=generator)
+    angles = phase.double() + torch.einsum("na,awd->nwd", points, waves.double())
+    regular, scattered = Lattice(points), Lattice(points + 1e-4 * torch.rand(points.shape, generator=generator))
+    assert regular.gridded and not scattered.gridded
+    for found in (regular.sum_of_waves(waves, phase), regular._one_by_one(waves, phase)):
+        assert torch.allclose(found.double(), angles.cos().sum(1), atol=1e-4)
 
 
 def test_the_inflation_follows_the_data_and_not_their_units():

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from math import isclose
-
 import pytest
 import torch
 
@@ -11,6 +9,7 @@ import regularize
 from regularize.basis.knots import Knots
 from regularize.smoothing import search
 from regularize.statistics import likelihood
+from regularize.statistics.extrapolation import Extrapolation
 
 
 def flow(noise=0.15, side=11):
@@ -29,11 +28,18 @@ def chosen(**options):
     return field.choice, float((field(points) - truth).norm() / truth.norm())
 
 
+class Plain(Extrapolation):
+    """The iteration as it is."""
+
+    def next(self, place, mapped):
+        return mapped
+
+
 def test_coarser_knots_first_and_foretold_steps_lead_to_the_same_choice(monkeypatch):
     found, error = chosen()
     with monkeypatch.context() as patch:
         patch.setattr(search, "WORTH_COARSER", float("inf"))
-        patch.setattr(likelihood, "_still_to_come", lambda steps: 0.0)
+        patch.setattr(likelihood, "Extrapolation", Plain)
         patch.setattr(likelihood, "SETTLED", 1e-4)
         crept, least = chosen(rounds=100)
     assert crept.settled and found.settled
@@ -56,16 +62,29 @@ def test_the_short_cuts_are_shorter(monkeypatch):
     rounds.clear()
     with monkeypatch.context() as patch:
         patch.setattr(search, "WORTH_COARSER", float("inf"))
-        patch.setattr(likelihood, "_still_to_come", lambda steps: 0.0)
+        patch.setattr(likelihood, "Extrapolation", Plain)
+        patch.setattr(likelihood, "SETTLED", 0.03)  # what leaves as much of the creeping iteration still to come
         chosen()
     assert set(rounds) == {most} and short < len(rounds)
 
 
-def test_steps_that_shrink_by_the_same_ratio_are_summed():
-    steps = [0.2 * 0.6**k for k in range(60)]
-    assert isclose(likelihood._still_to_come(steps[:4]), sum(steps[4:]), rel_tol=1e-9)
-    for others in ([0.2], [0.2, 0.19], [0.2, -0.1], [0.0, 0.1], [0.1, 0.2]):
-        assert likelihood._still_to_come(others) == 0.0
+def test_a_linear_iteration_is_at_its_end_after_as_many_steps_as_it_has_directions():
+    generator = torch.Generator().manual_seed(1)
+    turn = torch.linalg.qr(torch.randn(2, 2, generator=generator, dtype=torch.float64)).Q
+    shrink = turn @ torch.diag(torch.tensor([0.7, -0.4], dtype=torch.float64)) @ turn.T
+    end = torch.tensor([0.3, -0.2], dtype=torch.float64)
+
+    def places(ahead, count):
+        place = torch.zeros(2, dtype=torch.float64)
+        for _ in range(count):
+            place = ahead.next(place, end + shrink @ (place - end))
+        return place
+
+    first = Extrapolation()
+    assert float((places(first, 3) - end).norm()) < 1e-9
+    # another one like it knows them all from the start
+    end = torch.tensor([-0.1, 0.4], dtype=torch.float64)
+    assert float((places(Extrapolation(first), 1) - end).norm()) < 1e-9
 
 
 def test_knots_that_are_spread_out_cover_the_same_box():

@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
+import geometry
 from torchsph.cli.command import Command
 from torchsph.cli.cures import late_fault
 from torchsph.cli.exit_codes import ExitCode, exit_code
@@ -52,6 +57,28 @@ def test_a_fault_of_the_input_names_it() -> None:
         args = argparse.Namespace(**vars(FULL), also=["also.h5"])
         assert late_fault(ValueError(named), ExitCode.INPUT, args) is None
     assert late_fault(ValueError("no such option"), ExitCode.INPUT, None) == "no such option"
+
+
+def test_a_second_input_is_told_by_its_own_name(
+    box_recording: Callable[..., geometry.Recording], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def flow(points: np.ndarray, time: float) -> np.ndarray:
+        return 0.1 * np.cos(100 * points + time)
+
+    first, other = (box_recording(flow, nodes=5, times=times) for times in ((0.0, 0.01), (0.0, 0.02)))
+    for name, recording in (("a.h5", first), ("late.h5", other), ("bare.h5", replace(first, wall=None))):
+        geometry.write_recording(tmp_path / name, recording)
+    for name, told in (("late.h5", "has no frame at 0.01 s"), ("bare.h5", "/wall: is not in this recording")):
+        for call in (
+            ["quantify", "--out", str(tmp_path / "q"), "--truth"],
+            ["report", "--out", str(tmp_path / "r.html"), "--measurement"],
+            ["assimilate", "--method", "spline", "--out", str(tmp_path / "o"), "--truth"],
+        ):
+            if name == "bare.h5" and call[0] != "quantify":
+                continue  # they need no wall of it
+            assert main([*call, str(tmp_path / name), str(tmp_path / "a.h5")]) == 2
+            said = capsys.readouterr().err.splitlines()[-1]
+            assert said.startswith(f"torchsph {call[0]}: error: {tmp_path / name}: ") and told in said
 
 
 @pytest.mark.parametrize(("fault", "code"), [(MemoryError(), 3), (NumericalFailure("all failed"), 4)])

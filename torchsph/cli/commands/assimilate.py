@@ -29,6 +29,7 @@ from ..budget import NAME as SPACING_FILE
 from ..budget import chosen_spacing
 from ..checks import check_spacing, informative, usable_device
 from ..command import Command
+from ..cures import about
 from ..outputs import output_folder, staged, write_json, write_result
 from ..printing import print_table, run_config, say
 from ..quantity_tables import QuantityTables, methods_read_out
@@ -111,7 +112,8 @@ def assimilate(args: argparse.Namespace) -> None:
         bought = chosen_spacing(args, partial(_afforded, measured, methods, args), kept)
         check_spacing(args.spacing, measured)
         read_out = methods_read_out(args, methods, measured)
-        raw = metrics.evaluate(measured, truth, measured)  # first: a truth that does not fit must not cost a run
+        with about(str(truth_path or measured_path)):  # first: a truth that does not fit must not cost a run
+            raw = metrics.evaluate(measured, truth, measured)
         saved, resume = folder / "checkpoint.pt", args.resume
         if "ensemble" in methods and lead:
             resume = _kept(saved, args.resume)

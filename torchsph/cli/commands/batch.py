@@ -20,6 +20,7 @@ from ..running.isolated import SECONDS_TO_READ, isolated, memory_to_read
 from ..running.items import Item, listed
 from ..running.provenance import fingerprint, input_digests
 from ..running.settings import as_arguments
+from ..running.small_files import read_small
 from . import assimilate
 
 DONE, BEFORE, FAILED, STOPPED = "done", "done before", "failed", "stopped"
@@ -101,9 +102,9 @@ def _finished(folder: Path) -> str | None:
     if not (folder / "analysis.h5").is_file():
         return None
     try:
-        document = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
+        document = json.loads(read_small(folder / "metrics.json"))
         return str(document["config"]["info"]["provenance"]["fingerprint"])
-    except (OSError, ValueError, KeyError, TypeError):  # an older version's, or half a copy
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):  # an older version's, or half a copy
         return None
 
 

@@ -15,6 +15,7 @@ from geometry.recordings.whole_file import write_whole
 from ..checks import output_file
 from ..command import Command
 from ..printing import say
+from ..running.small_files import read_small
 
 FIRST = ("item", "state", "method")
 LAST = ("seconds", "torchsph", "fingerprint")
@@ -50,7 +51,7 @@ def collect(args: argparse.Namespace) -> None:
 def _rows(folder: Path, item: str) -> list[dict[str, Any]]:
     """A row for each method of a folder; one that says so where there is none."""
     try:
-        document = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
+        document = json.loads(read_small(folder / "metrics.json"))
         methods, seconds, config = document["methods"], document["seconds"], document["config"]
         rows = []
         for name, measures in methods.items():
@@ -60,7 +61,7 @@ def _rows(folder: Path, item: str) -> list[dict[str, Any]]:
             rows.append(row)
     except FileNotFoundError:
         return [{"item": item, "state": "unfinished"}]
-    except (ValueError, KeyError, TypeError, AttributeError):
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
         return [{"item": item, "state": "damaged"}]
     return rows
 
@@ -68,9 +69,9 @@ def _rows(folder: Path, item: str) -> list[dict[str, Any]]:
 def _listed(root: Path) -> list[str]:
     """The items that the last ``torchsph batch`` of all of them has gone through."""
     try:
-        items = json.loads((root / "summary.json").read_text(encoding="utf-8"))["items"]
+        items = json.loads(read_small(root / "summary.json"))["items"]
         return [str(item["item"]) for item in items]
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return []
 
 

@@ -11,6 +11,7 @@ from torchsph.methods.members.quantities import quantified
 
 from ..arguments import add_output_folder
 from ..command import Command
+from ..cures import about
 from ..outputs import output_folder, staged
 from ..quantity_tables import QuantityTables
 from ..running.folder_lock import locked
@@ -34,7 +35,10 @@ def quantify(args: argparse.Namespace) -> None:
     geometry.measurement_type(recording).require_full(f"{args.analysis}: quantities need")
     truth = None if args.truth is None else geometry.read_recording(args.truth)
     members = None if args.members is None else quantified(recording, read_members(args.members, recording))
-    tables = QuantityTables.of(recording, members, truth)
+    tables = QuantityTables.of(recording, members)
+    if truth is not None:
+        with about(args.truth):
+            tables.compare(truth)
     inputs = {"analysis": args.analysis, "truth": args.truth, "members": args.members}
     config = {"torchsph": __version__, **inputs, "info": {"provenance": provenance(args, inputs)}}
     with locked(folder), staged(folder) as scratch:

@@ -9,12 +9,15 @@ from typing import Any
 
 import geometry
 from torchsph.evaluation import metrics
+from torchsph.evaluation.frames import matching_frames
 from torchsph.report import write_report
 
 from ..checks import output_file
 from ..command import Command
+from ..cures import about
 from ..printing import say
 from ..running.provenance import provenance
+from ..running.small_files import read_small
 
 
 def _arguments(parser: argparse.ArgumentParser) -> None:
@@ -32,6 +35,10 @@ def report(args: argparse.Namespace) -> None:
     measured, truth = (
         None if name is None else geometry.read_recording(name) for name in (args.measurement, args.truth)
     )
+    for name, other in ((args.measurement, measured), (args.truth, truth)):
+        if other is not None:
+            with about(name):
+                matching_frames(analysis.time, other.time, "this recording")
     named = {"raw": measured, "analysis": analysis}
     scores = {
         name: metrics.evaluate(recording, truth, measured) for name, recording in named.items() if recording is not None
@@ -53,9 +60,10 @@ def report(args: argparse.Namespace) -> None:
 
 def _document(name: str) -> dict[str, Any]:
     """The document of quantities in a file, refused where it is none."""
+    content = read_small(name)
     try:
-        found = json.loads(Path(name).read_text(encoding="utf-8"))
-    except ValueError as fault:
+        found = json.loads(content)
+    except (ValueError, RecursionError) as fault:
         raise ValueError(f"--quantities {name}: is no JSON ({fault}); give what `torchsph quantify` wrote") from fault
     if not isinstance(found, dict) or "curves" not in found:
         raise ValueError(f"--quantities {name}: has no curves; give what `torchsph quantify` wrote")

@@ -8,6 +8,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from .small_files import read_small
+
 LISTS = (".txt", ".lst", ".list")
 
 
@@ -58,7 +60,7 @@ def listed(inputs: Sequence[str], root: str | Path) -> list[Item]:
 def _named(name: str) -> list[Path]:
     if name.lower().endswith(LISTS):
         folder = Path(name).parent
-        lines = (line.strip() for line in Path(name).read_text(encoding="utf-8", errors="surrogateescape").splitlines())
+        lines = (line.strip() for line in read_small(name).decode("utf-8", "surrogateescape").splitlines())
         return [folder / line for line in lines if line and not line.startswith("#")]
     if any(letter in name for letter in "*?[") and not os.path.exists(name):
         found = sorted(glob.glob(name, recursive=True))

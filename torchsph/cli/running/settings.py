@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from ..terminal import printable
+from .small_files import read_small
 
 # of the program and not of the run, so of no use in a file
 _NOT_WRITTEN = ("run", "command", "config")
@@ -45,9 +46,8 @@ def take_config(parser: argparse.ArgumentParser, path: str | Path, command: str,
         ValueError: no TOML, an option that the command does not have, or a value that the option does not take.
     """
     try:
-        with open(path, "rb") as file:
-            content = tomllib.load(file)
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as fault:
+        content = tomllib.loads(read_small(path).decode("utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as fault:
         raise ValueError(f"--config {path}: is no TOML: {fault}") from fault
     tables = {name: value for name, value in content.items() if isinstance(value, dict)}
     for name in tables:

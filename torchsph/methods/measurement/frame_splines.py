@@ -100,7 +100,7 @@ class FrameSmoother:
         group = frame // self.choose_every
         if group not in self._choices:
             middle = _middle(self, group)
-            self._choices[group] = None if middle is None else self._fit(middle).choice
+            self._choices[group] = None if middle is None else self._chosen(middle)
         return self._choices[group]
 
     def fit(self, frame: int, *, uncertainty: bool = False) -> regularize.SplineField:
@@ -186,14 +186,14 @@ class FrameSmoother:
         """(n, D) nodes in the mask of a frame."""
         return self.nodes[torch.from_numpy(np.array(self.recording.mask[frame], bool).reshape(-1))]
 
-    def _fit(
-        self,
-        frame: int,
-        *,
-        uncertainty: bool = False,
-        choice: regularize.Choice | None = None,
-        walls: bool = True,
-    ) -> regularize.SplineField:
+    def _chosen(self, frame: int) -> regularize.Choice | None:
+        """What the fit of a frame alone would choose."""
+        points, rows, confidence, _ = self._samples(frame)
+        where = self._inside(frame)
+        return self._trusting(frame).choose(points, rows, confidence, self._walls(frame), divergence_points=where)
+
+    def _samples(self, frame: int) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
+        """Points (n, D), velocities (n, D), confidences (n,) and beams of a frame, for the rows of its spline."""
         recording, dimension = self.recording, self.recording.dimension
         mask = torch.from_numpy(np.array(recording.mask[frame], bool).reshape(-1))
         weight = torch.from_numpy(node_weights(recording, frame).astype(np.float64).reshape(-1))
@@ -204,7 +204,18 @@ class FrameSmoother:
         field = recording.velocity[frame].reshape(dimension, -1)
         samples = torch.from_numpy(np.nan_to_num(field, copy=True)).double().T
         components = self.type.at(frame, torch.nonzero(used).squeeze(1))
-        points, rows, confidence, beam = components.spline_rows(self.nodes[used], samples[used], weight[used])
+        return components.spline_rows(self.nodes[used], samples[used], weight[used])
+
+    def _fit(
+        self,
+        frame: int,
+        *,
+        uncertainty: bool = False,
+        choice: regularize.Choice | None = None,
+        walls: bool = True,
+    ) -> regularize.SplineField:
+        recording = self.recording
+        points, rows, confidence, beam = self._samples(frame)
         together = self._open_together(frame)
         known_flux = walls and self.motion is not None and (bool(recording.fluxes) or bool(together)) and self.type.full
         smoother = self._trusting(frame) if walls else self.smoother
@@ -213,7 +224,7 @@ class FrameSmoother:
             rows,
             confidence,
             self._walls(frame) if walls else None,
-            divergence_points=self.nodes[mask],
+            divergence_points=self._inside(frame),
             beam=beam,
             uncertainty=uncertainty or known_flux,
             choice=choice,

@@ -22,9 +22,13 @@ import geometry
 from geometry.grids.cubic import CubicInterpolation
 from geometry.grids.fields import continued
 
+from ..walls.closest import closest_on_grid
+
 # distance from what is no blood, in grid spacings, up to which the detail moves with the wall, and from which on with
 # the fluid: the first layer of nodes, and two farther on
 WALL_LAYER, CORE = 1.0, 3.0
+SLACK = 1.0  # grid spacings by which the wall may be farther from a node than the first node that holds no blood
+EVEN = 1.0 + 1e-9  # ratio of spacings along the axes up to which they are one
 
 
 class CarriedDetail:
@@ -56,7 +60,7 @@ class CarriedDetail:
         node = torch.nonzero(mask.reshape(-1)).squeeze(1)
         points = self.grid.nodes(dtype=displacement.dtype, device=displacement.device)[node]
         core = self._core(mask)[node].to(displacement)[:, None]
-        beside = (1 - core) * self._with_wall(time, points, core < 1)
+        beside = (1 - core) * self._with_wall(time, node, core[:, 0]).to(core)
         found = torch.zeros_like(displacement).flatten(2)
         for member, spline in enumerate(self.splines):
             moved = core * displacement[member].flatten(1)[:, node].T + beside
@@ -72,17 +76,35 @@ class CarriedDetail:
         distance = torch.from_numpy(distance_transform_edt(inside, sampling=step)).reshape(-1)
         return ((distance - WALL_LAYER) / (CORE - WALL_LAYER)).clamp(0, 1).to(mask.device)
 
-    def _with_wall(self, time: float, points: Tensor, near: Tensor) -> Tensor:
-        """(n, D), m: by how much the nearest place of the wall has moved, for the points that are near it."""
-        found = torch.zeros_like(points)
+    def _with_wall(self, time: float, node: Tensor, core: Tensor) -> Tensor:
+        """(n, D), m: by how much the nearest place of the wall has moved, for those of the nodes (n,) near it."""
+        found = torch.zeros(len(node), self.grid.dimension, dtype=torch.float64, device=node.device)
         if self.walls is None or not self.walls.moves:
             return found
-        row = torch.nonzero(near.squeeze(1)).squeeze(1)
-        surface = self.walls.surface(time)
-        closest = geometry.SurfaceIndex(surface, min(self.grid.spacing)).query(points[row].cpu().double().numpy())
-        travelled = closest.interpolate(surface, surface.vertices - self.begun)
-        found[row] = torch.from_numpy(travelled).to(points)
+        near = core < 1
+        row, depth = node[near].cpu().numpy(), WALL_LAYER + (CORE - WALL_LAYER) * core[near].cpu().double().numpy()
+        found[near] = torch.from_numpy(self._travelled(self.walls.surface(time), row, depth + SLACK)).to(found)
         return found
+
+    def _travelled(self, surface: geometry.Surface, row: np.ndarray, reach: np.ndarray) -> np.ndarray:
+        """(n, D), m: by how much the place of the wall has moved that is the nearest to each of some nodes.
+
+        Args:
+            surface: the wall.
+            row: (n,) of the nodes.
+            reach: (n,) grid spacings, within which it is most likely to be.
+        """
+        way, spacing = surface.vertices - self.begun, min(self.grid.spacing)
+        travelled, far = np.zeros((len(row), self.grid.dimension)), np.ones(len(row), bool)
+        if max(self.grid.spacing) <= EVEN * spacing:
+            limit = np.zeros(self.grid.size)
+            limit[row] = reach * spacing
+            distance, carried = closest_on_grid(self.grid, surface, way, limit)
+            travelled, far = carried[row], distance[row] >= limit[row]
+        if far.any():  # the blood that is measured may end before the wall
+            closest = geometry.SurfaceIndex(surface, spacing).query(self.grid.nodes().numpy()[row[far]])
+            travelled[far] = closest.interpolate(surface, way)
+        return travelled
 
 
 def _continued(detail: Tensor, known: Tensor) -> Tensor:

@@ -91,6 +91,16 @@ def test_next_to_a_wall_it_moves_with_the_wall_and_in_the_core_with_the_fluid():
     torch.testing.assert_close(found[row, 11:14], detail[0, 0, row, 9:12], atol=1e-9, rtol=0)
 
 
+def test_the_nearest_place_of_the_wall_is_the_same_however_it_is_found():
+    """From the wall's faces where it is within reach, else by the surface's index."""
+    walls, row = moving_box(STEP), np.arange(0, GRID.size, 7)
+    carried = CarriedDetail(GRID, torch.zeros(1, 2, *GRID.shape), EVERYWHERE, walls, 0.0)
+    surface = walls.surface(0.004)
+    ways = [carried._travelled(surface, row, np.full(len(row), reach)) for reach in (3.0, 0.0)]
+    np.testing.assert_allclose(*ways, atol=1e-15)
+    assert ways[0][:, 0].min() > 0.3 * STEP
+
+
 def test_where_nothing_is_known_the_nearest_detail_goes_on():
     known = EVERYWHERE.clone()
     known[:, 12:] = False

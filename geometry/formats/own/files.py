@@ -17,12 +17,12 @@ from geometry.recordings.odd_files import PACKED, UNWRITTEN
 from geometry.recordings.read import read_recording
 from geometry.recordings.recording import Recording
 
-from .assemble import Fields
-from .field_map import FieldMap
-from .labelled_arrays import from_xarray
-from .own_mark import MARK, SOURCE, Mark
-from .series import read_fields
-from .source import FormatError
+from ..assemble import Fields
+from ..field_map import FieldMap
+from ..labelled_arrays import from_xarray
+from ..series import read_fields
+from ..source import FormatError
+from .mark import MARK, SOURCE, Mark
 
 SCALARS = ("pressure", "pressure_sigma")
 LONGEST = 1 << 30  # characters of a mark
@@ -236,7 +236,7 @@ def _listed(series: Path) -> list[Path]:
     """The frames that a ParaView series names, which lie beside it."""
     try:
         names = [str(one["name"]) for one in json.loads(series.read_text(encoding="utf-8"))["files"]]
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return []
     return [series.with_name(Path(name).name).resolve() for name in names]
 

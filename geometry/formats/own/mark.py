@@ -23,7 +23,7 @@ from geometry.recordings.errors import RecordingError
 from geometry.recordings.opening_flux import fluxes_of
 from geometry.recordings.recording import LAYOUT, Recording, Wall
 
-from .source import FormatError
+from ..source import FormatError
 
 MARK = "torchsph_recording"
 SOURCE = "torchsph_source"  # in the place of the mark, the file beside it whose values are shown
