@@ -64,7 +64,7 @@ def test_what_quantify_writes_is_understood(box_recording):
     members = {name: np.stack([row, 1.2 * row, 0.8 * row]) for name, row in curves.curves["analysis"].items()}
     bands = {name: summary(rows) for name, rows in members.items()}
     beat = {name: summary(rows) for name, rows in beat_numbers(flow.time, members).items()}
-    document = QuantityTables(flow.time, curves.curves, bands, beat).document({})
+    document = QuantityTables(flow.time, curves.kind, curves.curves, bands, beat).document({})
     energy = next(one for one in curves_of(document) if one.name == "kinetic_energy")
     assert [line.label for line in energy.lines] == ["analysis", "members", "truth"]
     np.testing.assert_array_equal(energy.lines[1].low, bands["kinetic_energy"].low)
