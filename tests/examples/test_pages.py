@@ -179,6 +179,7 @@ def test_what_to_believe_is_what_was_measured():
 
 RIVALS = {
     "**ensemble**, the default": "ensemble",
+    "**splines** averaged over time (`smooth --over-time auto`)": "spline over time",
     "**splines**, frame by frame": "spline",
     "Helmholtz-Leray projection, averaged over time": "leray over time",
     "Gaussian in space and time": "gaussian over time",
