@@ -111,7 +111,8 @@ def analyses(noise: str) -> list[Point]:
     own = [Point(name, row["seconds"], row["nrmse"], "torchsph") for name, row in table.items() if name not in left_out]
     rows = json.loads(RIVALS.read_text(encoding="utf-8"))["rows"].get(noise, {}) if RIVALS.is_file() else {}
     others = {name: row for name, row in rows.items() if name not in ("raw", "spline", "ensemble")}
-    return own + [Point(name, row["seconds"], row["nrmse"], "rival") for name, row in others.items()]
+    groups = {name: "torchsph" if name == "spline over time" else "rival" for name in others}
+    return own + [Point(name, row["seconds"], row["nrmse"], groups[name]) for name, row in others.items()]
 
 
 def front(points: list[Point]) -> list[Point]:
