@@ -16,10 +16,12 @@ METHODS = ("spline, thesis", "sph, thesis", "spline, default", "ensemble, defaul
 
 def make(material: Material) -> Result:
     """RMS error of every frame by method, and of the measurement itself."""
-    truth = material.true_frames
-    mask, true = np.asarray(truth.mask, bool), np.nan_to_num(truth.velocity)
     fields = {"raw": filled_velocity(material.measured)}
     fields |= {method: material.analysis(method).velocity for method in METHODS}
+    frames = min(map(len, fields.values()))  # that all of them have
+    fields = {name: field[:frames] for name, field in fields.items()}
+    truth = material.true_frames.select(slice(0, frames))
+    mask, true = np.asarray(truth.mask, bool), np.nan_to_num(truth.velocity)
     errors = {name: per_frame_error(field, true, mask) for name, field in fields.items()}
     numbers = {
         "time": truth.time.tolist(),

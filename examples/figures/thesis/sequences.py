@@ -18,10 +18,12 @@ INTERVAL = 0.05  # s
 
 def make(material: Material) -> Result:
     """How much of the true field's curvature each sequence has: below 1 it looks softer than the truth."""
-    truth, measured = material.true_frames, material.measured
+    fields = {method: np.asarray(material.analysis(method).velocity) for method in METHODS}
+    lived = slice(0, min(map(len, fields.values())))  # frames that all of them have
+    fields = {method: field[lived] for method, field in fields.items()}
+    truth, measured = material.true_frames.select(lived), material.measured.select(lived)
     mask = np.asarray(truth.mask, bool)
     true = np.where(mask[:, None], np.nan_to_num(truth.velocity), 0.0)
-    fields = {method: np.asarray(material.analysis(method).velocity) for method in METHODS}
     deep = np.stack([(laplace(one.astype(float), mode="constant") == 0) & one for one in mask])
     texture = {name: _curvature(field, deep) / _curvature(true, deep) for name, field in fields.items()}
     numbers = {"texture": texture, "times": truth.time.tolist()}
