@@ -20,6 +20,7 @@ import geometry
 from torchsph.evaluation.slices import Plane, cut, valve_plane
 
 DPI = 80
+MOST_BYTES = 150_000  # of a picture
 WIDTH = 10.0  # inches, of a picture
 PANEL = 1.9  # inches, of one frame in a plane
 COLOURS = 128  # of a picture's palette: keeps its file small
@@ -97,11 +98,15 @@ def sequence(
 
 
 def save(figure: Figure, file: Path) -> None:
-    """Write a picture as PNG with a palette, whole or not at all."""
-    buffer = io.BytesIO()
-    figure.savefig(buffer, dpi=DPI, format="png")
+    """Write a picture as PNG with a palette, whole or not at all; a large one with fewer dots per inch."""
+    part, dpi = file.with_suffix(".part"), float(DPI)
+    while True:
+        buffer = io.BytesIO()
+        figure.savefig(buffer, dpi=dpi, format="png")
+        image = Image.open(buffer).convert("RGB").quantize(COLOURS, kmeans=1, dither=Image.Dither.NONE)
+        image.save(part, format="PNG", optimize=True)
+        if part.stat().st_size < MOST_BYTES or dpi < 0.5 * DPI:
+            break
+        dpi *= 0.85
     plt.close(figure)
-    image = Image.open(buffer).convert("RGB").quantize(COLOURS, kmeans=1, dither=Image.Dither.NONE)
-    part = file.with_suffix(".part")
-    image.save(part, format="PNG", optimize=True)
     part.replace(file)
