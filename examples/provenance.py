@@ -105,15 +105,16 @@ def command() -> str:
     return f"python {named} " + shlex.join(Path(each).name if "/" in each else each for each in sys.argv[1:])
 
 
-def write_table(file: Path, content: dict[str, Any], sources: Sequence[str]) -> None:
+def write_table(file: Path, content: dict[str, Any], sources: Sequence[str], **more: str) -> None:
     """Write a table with where it comes from, under "from"; it appears whole or not at all.
 
     Args:
         file: to write.
         content: the table, as JSON can hold it.
         sources: files and folders below the root whose change makes it stale.
+        more: what else "from" says, or says otherwise than this run.
     """
-    content = {name: value for name, value in content.items() if name != "from"} | {"from": provenance(sources)}
+    content = {name: value for name, value in content.items() if name != "from"} | {"from": provenance(sources) | more}
     part = file.with_suffix(".part")
     part.write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
     part.replace(file)

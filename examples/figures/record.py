@@ -77,11 +77,8 @@ def confirmed(file: Path, check: object) -> bool:
     if not alike(content.get("check"), json.loads(json.dumps(check))):
         return False
     made = content["from"]
-    first = made.get("numbers of", made["commit"])
-    write_table(file, content, made["sources"])
-    again = json.loads(file.read_text(encoding="utf-8"))
-    again["from"] |= {"command": made["command"], "numbers of": first}
-    file.write_text(json.dumps(again, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    kept = {"command": made["command"], "numbers of": made.get("numbers of", made["commit"])}
+    write_table(file, content, made["sources"], **kept)
     return True
 
 

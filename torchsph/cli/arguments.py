@@ -16,7 +16,7 @@ from .terminal import printable
 
 # folder of the results where no other is named
 OUT = "torchsph-out"
-# in the place of a spacing: as fine as the budget allows
+# in the place of a number: as the budget, or the data, tell
 AUTO = "auto"
 
 
@@ -38,7 +38,12 @@ class Parser(argparse.ArgumentParser):
 def add_model_options(parser: argparse.ArgumentParser) -> None:
     """Which simulator, how fine, and on which device."""
     parser.add_argument("--preset", choices=tuple(PRESETS), default="default", help="of the simulator (%(default)s)")
-    parser.add_argument("--spacing", type=_spacing, metavar="M", help="of the particles, m, or auto: by --budget")
+    parser.add_argument(
+        "--spacing",
+        type=number_or_auto(0, open_below=True),
+        metavar="M",
+        help="of the particles, m, or auto: by --budget",
+    )
     parser.add_argument(
         "--budget",
         type=number(0, open_below=True),
@@ -46,10 +51,6 @@ def add_model_options(parser: argparse.ArgumentParser) -> None:
         help="seconds for the run: the finest particles are taken that fit",
     )
     parser.add_argument("--device", default="cpu", metavar="D", help="cpu, cuda or cuda:N (%(default)s)")
-
-
-def _spacing(text: str) -> float | str:
-    return AUTO if text == AUTO else number(0, open_below=True)(text)
 
 
 def add_workers(parser: argparse.ArgumentParser) -> None:
@@ -111,6 +112,12 @@ def number(low: float, high: float = math.inf, open_below: bool = False) -> Call
         return value
 
     return convert
+
+
+def number_or_auto(low: float, open_below: bool = False) -> Callable[[str], float | str]:
+    """Such a number, or the word AUTO."""
+    convert = number(low, open_below=open_below)
+    return lambda text: AUTO if text == AUTO else convert(text)
 
 
 def seconds(text: str) -> tuple[float, ...]:

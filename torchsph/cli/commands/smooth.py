@@ -13,7 +13,7 @@ from torchsph.methods.measurement.prepared import PreparedMeasurement
 from torchsph.methods.memory import free_memory
 from torchsph.methods.runtime.workers import chosen_workers
 
-from ..arguments import AUTO, add_sidecar, add_workers, number
+from ..arguments import AUTO, add_sidecar, add_workers, number_or_auto
 from ..checks import full_vectors, informative, output_file
 from ..command import Command
 from ..outputs import write_analysis
@@ -27,17 +27,12 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", required=True, metavar="SMOOTH.h5", help="the smoothed recording")
     parser.add_argument(
         "--over-time",
-        type=_width,
+        type=number_or_auto(0),
         metavar="SECONDS",
         help="average neighbouring frames by a Gaussian of this deviation, or auto: as wide as the frames tell",
     )
     add_workers(parser)
     add_sidecar(parser)
-
-
-def _width(text: str) -> float | str:
-    """A number of seconds, or the word for as the data tell."""
-    return AUTO if text == AUTO else number(0)(text)
 
 
 def smooth(args: argparse.Namespace) -> None:

@@ -19,7 +19,7 @@ _FRAMES = 4  # whose splines tell how large the noise is
 def noise_of(recording: geometry.Recording) -> float:
     """Deviation of a component's error, m/s: as stated, or what splines of a few frames leave."""
     if recording.sigma is not None:
-        return float(np.median(recording.sigma.transpose(1, 0, *range(2, recording.sigma.ndim))[:, recording.mask]))
+        return float(np.median(np.moveaxis(recording.sigma, 1, 0)[:, np.asarray(recording.mask, bool)]))
     frames = np.unique(np.linspace(0, recording.frames - 1, _FRAMES + 2).astype(int)[1:-1])
     deviation = PreparedMeasurement(recording.select(frames)).error.deviation
     assert deviation is not None  # nothing is stated

@@ -21,7 +21,7 @@ from torchsph.haemodynamics.fields.acceleration import time_derivative
 from ..measurement.frame_splines import FrameSmoother
 from .amplitude import Amplitude
 from .frames import MemberFrame
-from .resolution import Resolution
+from .resolution import Resolution, seen_again
 
 __all__ = ["spline_frames"]
 
@@ -69,17 +69,8 @@ def spline_frames(
         fields, mask, time = np.stack(held), np.asarray(smoothed.mask[span], bool), smoothed.time[span]
         rate = time_derivative(fields, mask, time, frame - first, order=_ORDER, events=events)
         here = held[frame - first]
-        again = _once_more(resolution, here[0], rate[0], frame)
+        again = seen_again(resolution, here[0], rate[0], frame)
         yield MemberFrame(frame, here[0], here[1:], rate[0], rate[1:], None, *again)
-
-
-def _once_more(
-    resolution: Resolution | None, field: NDArray[np.float32], rate: NDArray[np.floating], frame: int
-) -> tuple[NDArray[np.floating], NDArray[np.floating]] | tuple[None, None]:
-    """A field and its rate as the measurement's kernel shows them once more."""
-    if resolution is None:
-        return None, None
-    return resolution.of_field(torch.from_numpy(field), frame).numpy(), resolution.of_rate(rate, frame)
 
 
 def _drawn(

@@ -24,7 +24,7 @@ import geometry
 
 from ..runtime.parallel import is_lead
 from .amplitude import Amplitude
-from .resolution import Resolution
+from .resolution import Resolution, seen_again
 
 __all__ = ["FrameObserver", "MemberFrame", "MemberFrames", "at_frame"]
 
@@ -110,8 +110,6 @@ class MemberFrames:
             around = around + self.amplitude.of_fields(field, frame)
         around = torch.where(mask, around, 0.0).to(torch.float32)
         self._frame, self._pending = frame, {"field": field, "members": around}
-        if self.resolution is not None:
-            self._pending["coarser"] = self.resolution.of_field(field, frame)
 
     def forecast(self, rate: Tensor, member_rates: Tensor, failed: Tensor, pressure: Tensor) -> None:
         """The forecast from the last frame analysed, which can be handed on now.
@@ -167,16 +165,15 @@ class MemberFrames:
             nothing = torch.full(size, torch.nan)
             sides = [nothing if side is None else side[name] for side in (before, after)]
             both[name] = at_frame(sides[0], sides[1], weights).numpy()
-        rate = np.nan_to_num(both["rate"])
+        field, rate = pending["field"].numpy(), np.nan_to_num(both["rate"])
         made = MemberFrame(
             frame,
-            pending["field"].numpy(),
+            field,
             pending["members"].numpy(),
             rate,
             np.nan_to_num(both["member_rates"]),
             without_mean(both["pressure"], np.asarray(self.recording.mask[frame], bool)),
-            None if self.resolution is None else pending["coarser"].numpy(),
-            None if self.resolution is None else self.resolution.of_rate(rate, frame),
+            *seen_again(self.resolution, field, rate, frame),
         )
         for observer in self.observers if is_lead() else ():
             observer.take(made)

@@ -20,7 +20,7 @@ from geometry.grids.fields import fwhm_to_deviation, masked_blur
 
 from ..measurement.wall_balance import WallBalance
 
-__all__ = ["Resolution"]
+__all__ = ["Resolution", "seen_again"]
 
 
 class Resolution:
@@ -61,3 +61,12 @@ class Resolution:
 
     def _mask(self, frame: int) -> Tensor:
         return torch.from_numpy(np.array(self.recording.mask[frame], bool))
+
+
+def seen_again(
+    resolution: Resolution | None, field: NDArray[np.floating], rate: NDArray[np.floating], frame: int
+) -> tuple[NDArray[np.floating], NDArray[np.floating]] | tuple[None, None]:
+    """An estimate and its du/dt (D, *shape) as the kernel shows them once more; nothing where no kernel is known."""
+    if resolution is None:
+        return None, None
+    return resolution.of_field(torch.from_numpy(field), frame).numpy(), resolution.of_rate(rate, frame)
