@@ -15,6 +15,7 @@ from .state.particles import Particles
 from .state.units import Units
 from .valves.model import ValveModel, ValveSetting
 from .valves.registry import valve_model
+from .walls.displacement import WallDisplacement
 from .walls.fields import WallFields
 
 # particles that fill less of what encloses them have a free surface
@@ -171,9 +172,14 @@ class Domain:
             self.wall_keys(0.5 * (early + late), self.open_regions(0.5 * (early + late)))
 
     def wall_keys(
-        self, time: float, open_regions: tuple[int, ...]
+        self, time: float, open_regions: tuple[int, ...], displacement: WallDisplacement | None = None
     ) -> tuple[tuple[float, float], tuple[Tensor, Tensor]]:
         """Times (s) of the wall fields before and after ``time`` (s), and the fields, with some regions open.
+
+        Args:
+            time: s.
+            open_regions: regions of the walls that are no wall.
+            displacement: of the walls; None: they are where the scene has them.
 
         Raises:
             ValueError: the scene has no walls.
@@ -181,7 +187,11 @@ class Domain:
         if self.walls is None:
             raise ValueError("a scene without walls has no wall fields")
         early, late, start, stop = self.walls.key_times.bracket(time)
-        return (start, stop), (self.walls.key(early, open_regions), self.walls.key(late, open_regions))
+        if displacement is None:
+            return (start, stop), (self.walls.key(early, open_regions), self.walls.key(late, open_regions))
+        displaced = self.walls.displaced
+        first, second = (displaced(number, open_regions, displacement) for number in (early, late))
+        return (start, stop), (first, second)
 
     def gravity(self, particles: Particles, times: Tensor) -> Tensor | None:
         """Gravity at the particles, (N, D), internal, or None; ``times`` (members,), s, of their members."""

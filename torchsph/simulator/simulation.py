@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Protocol
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -24,6 +25,7 @@ from .stepping.pressure import Neighbourhood, divergence_free
 from .transfer.checks import check_grid, check_mask, check_some, check_velocity, check_weight
 from .transfer.fetching import fetch_on_grid
 from .transfer.imposing import pulled
+from .walls.displacement import WallDisplacement
 
 MOST_PROJECTIONS = 1000
 
@@ -86,6 +88,32 @@ class Simulation(AdvancingRun):
         self._stepper.use(self._coefficients)
         self._stepper.pair_search.radius = self._stepper.support.radius
         self._stepper.pair_search.forget()
+
+    def displace_walls(self, amount: float | Tensor | None, shapes: Tensor | np.ndarray | None = None) -> None:
+        """Move the walls along their outward normals, from now on, to first order.
+
+        For walls that are a little off where the scene has them, and for gradients in their place
+        (``Simulator.differentiable``). Good while an amount is small beside the particle spacing and the walls' radii
+        of curvature. Openings keep their outlines, valves the fluxes that they are given, and the particles their
+        places: displace before imposing.
+
+        Args:
+            amount: m, positive where the cavity grows: one number, or (K,) for as many shapes; None: back again.
+            shapes: (K, V), how far each vertex of the walls goes per amount; None: all by the one amount.
+
+        Raises:
+            ValueError: the scene has no walls; amounts and shapes that do not go together, or are not finite.
+        """
+        if amount is None:
+            self.surroundings.displacement = None
+        else:
+            walls = self.domain.scene.walls
+            if walls is None:
+                raise ValueError("the scene has no walls to displace")
+            vertices = walls.vertices_at_keys.shape[1]
+            self.surroundings.displacement = WallDisplacement.checked(amount, shapes, vertices)
+        if self.surroundings.entered:
+            self.surroundings.enter(self.time, self.time)
 
     @checked
     def impose(self, grid: Grid, velocity: Tensor, mask: Tensor, confidence: Tensor | None = None) -> None:

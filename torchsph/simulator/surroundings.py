@@ -17,6 +17,7 @@ from .state.record import Record
 from .transfer.exchange import Exchange
 from .transfer.imposing import fill_beyond
 from .walls.compiled import near_wall
+from .walls.displacement import WallDisplacement
 from .walls.fields import STRAY
 from .walls.interface import WallSample
 from .walls.look_up import LookUp
@@ -36,6 +37,7 @@ class PresentSurroundings:
         valve_acceleration: (N, D), the last one by pressure sources, internal, for the account of their work; None
             while all valves are shut.
         exchange_field: what comes in through a plane cut out of a flow, as the last imposed field has it, or None.
+        displacement: of the walls, from the next ``enter`` on; None: they are where the scene has them.
     """
 
     def __init__(self, domain: Domain) -> None:
@@ -43,6 +45,7 @@ class PresentSurroundings:
         self.valve_strength: float | Tensor = 1.0
         self.valve_acceleration: Tensor | None = None
         self.exchange_field: Exchange | None = None
+        self.displacement: WallDisplacement | None = None
         self._bracket: tuple[float, float] = (0.0, 1.0)
         self._keys: tuple[Tensor, Tensor] | None = None
         self._fields: LookUp | None = None
@@ -51,6 +54,16 @@ class PresentSurroundings:
     def entered(self) -> bool:
         """Whether there are walls to look up: an interval was entered, and the scene has some."""
         return self._fields is not None
+
+    @property
+    def wall_variable(self) -> Tensor | None:
+        """The walls' fields, where torch is to differentiate them (``LookUp.variable``)."""
+        return None if self._fields is None else self._fields.variable
+
+    def use_wall_variable(self, rows: Tensor) -> None:
+        """Look walls up in other fields, given as ``wall_variable`` has them, where these are to be differentiated."""
+        if self._fields is not None and rows.requires_grad:
+            self._fields = self._fields.with_variable(rows)
 
     def enter(self, start: float, stop: float, *, shut: bool = False) -> None:
         """Choose key frames and open valves for an interval (s) without breaks inside.
@@ -63,7 +76,7 @@ class PresentSurroundings:
         domain, middle = self.domain, 0.5 * (start + stop)
         open_regions = () if shut else domain.open_regions(middle)
         if domain.walls is not None:
-            self._bracket, keys = domain.wall_keys(middle, open_regions)
+            self._bracket, keys = domain.wall_keys(middle, open_regions, self.displacement)
             if self._keys is None or keys[0] is not self._keys[0] or keys[1] is not self._keys[1]:
                 self._keys, self._fields = keys, domain.walls.between(*keys)
         self.clock.enter(start, stop, open_regions, self.valve_strength)

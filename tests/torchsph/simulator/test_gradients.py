@@ -136,6 +136,30 @@ def test_in_the_flux_that_a_valve_is_given():
     assert float(found) == pytest.approx(wanted, rel=1e-3) and abs(wanted) > 0.05
 
 
+@pytest.mark.parametrize("name", SCHEMES)
+def test_in_the_place_of_the_walls(ventricle, name):
+    """All of the wall and its upper part alone, from walls .1 mm outward: nodes that lie on them jump otherwise."""
+    recording, scene = ventricle
+    scheme = dataclasses.replace(preset(name), **TIGHT) if name == "default" else preset(name)
+    height = scene.walls.vertices_at_keys[0][:, 2]
+    shapes = np.stack([np.ones(len(height)), (height - height.min()) / np.ptp(height)])
+    start = torch.tensor([1e-4, 5e-5], dtype=torch.float64)
+
+    def end(amount, differentiable=False):
+        run = Simulator(scene, scheme, dtype=torch.float64, differentiable=differentiable).start(0.30, seed=3)
+        run.displace_walls(amount, shapes)
+        run.impose(recording.grid, torch.from_numpy(recording.velocity[30]), torch.from_numpy(recording.mask[30]))
+        run.advance(0.305)
+        value = run.fetch(recording.grid, torch.from_numpy(recording.mask[30])).value[0]
+        return (value.nan_to_num() * draw(value.shape, 5)).sum()
+
+    amount = start.clone().requires_grad_()
+    (found,) = torch.autograd.grad(end(amount, True), amount)
+    for number, unit in enumerate(torch.eye(2, dtype=torch.float64)):
+        wanted = difference(lambda by, unit=unit: end(start + by * unit), 1e-8)
+        assert float(found[number]) == pytest.approx(wanted, rel=1e-4)
+
+
 def test_a_run_that_can_be_differentiated_has_the_bits_of_one_that_cannot(ventricle):
     field = torch.from_numpy(ventricle[0].velocity[30])
     plain = filled(ventricle, preset("default"), field, dtype=torch.float32)[1]

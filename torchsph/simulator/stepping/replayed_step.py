@@ -107,6 +107,7 @@ class Step:
         found["clock.valve_strength"] = clock.valve_strength
         if clock.flux_split is not None:
             found["split.flux"] = clock.flux_split.flux
+        found["walls.fields"] = self.surroundings.wall_variable
         return {name: value for name, value in found.items() if isinstance(value, Tensor)}
 
     def _apart(self) -> Step:
@@ -121,7 +122,8 @@ class Step:
     @staticmethod
     def _with(particles: Particles, values: dict[str, Tensor], step: Step) -> tuple[Step, Particles]:
         """``step`` and the particles before it with other values in the places of ``_inputs``."""
-        groups: dict[str, dict[str, Any]] = {"particles": {}, "coefficients": {}, "clock": {}, "split": {}}
+        owners = ("particles", "coefficients", "clock", "split", "walls")
+        groups: dict[str, dict[str, Any]] = {owner: {} for owner in owners}
         for place, value in values.items():
             owner, name = place.split(".")
             groups[owner][name] = value
@@ -129,6 +131,8 @@ class Step:
         around = copy(step.surroundings)
         around.clock = clock = copy(around.clock)
         _give(clock, groups["clock"], groups["split"])
+        if groups["walls"]:
+            around.use_wall_variable(groups["walls"]["fields"])
         stepper = step.stepper
         if groups["coefficients"]:
             stepper = stepper.apart(coefficients, step.record)

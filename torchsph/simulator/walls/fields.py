@@ -12,8 +12,10 @@ from geometry import Grid, OrificePlane, Surface, WallMotion, grid_winding, orif
 from geometry.motion.key_times import KeyTimes
 from torchsph.pairs.smoothing_kernels import SmoothingKernel
 
+from ..state.required import required
 from .closest import closest_on_grid
 from .completeness import KernelCompleteness
+from .displacement import WallDisplacement
 from .interface import CompleteWallSample, WallSample
 from .look_up import LookUp, by_node
 
@@ -109,13 +111,29 @@ class WallFields:
             self._made.popitem(last=False)
         return made
 
+    def displaced(self, number: int, open_regions: tuple[int, ...], displacement: WallDisplacement) -> Tensor:
+        """As ``key``, of walls that are displaced: torch can differentiate them in the displacement's amounts."""
+        label = (number, open_regions)
+        made = displacement.remembered(label)
+        if made is None:
+            time, plain = self.key_times.times[number], self.key(number, open_regions)
+            surface = self.motion.surface(time)
+            solid, limit = self._solid(surface, open_regions), self._limit(self._inside(surface, time))
+            carried = [closest_on_grid(self.grid, solid, values, limit)[1] for values in displacement.values(surface)]
+            d = plain[0] + displacement.outward(carried, plain[0], self.spacing)
+            made = displacement.remembered(label, self._channels(d, plain[1 + self.dimension : 1 + 2 * self.dimension]))
+        return required(made, "fields that were just made")
+
     def _make(self, number: int, open_regions: tuple[int, ...]) -> Tensor:
         time = self.key_times.times[number]
         distance, velocity = self._distance(self.motion.surface(time), time, open_regions)
         # to the device first: the transforms are most of what is left to do
         d = torch.from_numpy(distance / self.spacing).to(self.dtype).reshape(self.grid.shape).to(self.device)
         carried = torch.from_numpy(velocity.T / self.speed).to(self.dtype).reshape(-1, *self.grid.shape)
-        carried = carried.to(self.device)
+        return self._channels(d, carried.to(self.device))
+
+    def _channels(self, d: Tensor, carried: Tensor) -> Tensor:
+        """All fields, from the distance (*shape) and the walls' velocity (D, *shape), internal."""
         channels = [d[None], _normals(d), carried]
         if self._completeness is not None:
             channels.extend(self._completeness.at(d))
@@ -129,9 +147,7 @@ class WallFields:
         Exact inside as far as kernels see and outside as far as particles may stray; farther away a bound does.
         """
         inside = self._inside(surface, time)
-        shut = ~np.isin(surface.region, open_regions)
-        solid = Surface(surface.vertices, surface.faces[shut], surface.region[shut])
-        limit = np.where(inside, self.reach + 0.5 + _FIELD_SPACING, STRAY) * self.spacing
+        solid, limit = self._solid(surface, open_regions), self._limit(inside)
         distance, carried = closest_on_grid(self.grid, solid, self.motion.velocity(time), limit)
         np.negative(distance, out=distance, where=~inside)
         depth = (self.reach + 2.0) * self.spacing
@@ -141,6 +157,16 @@ class WallFields:
                 # the channel goes with its orifice as a whole: a rim that closes in must not squeeze what is beyond it
                 carried[channel] = opening.velocity(time)
         return distance, carried
+
+    def _limit(self, inside: np.ndarray) -> np.ndarray:
+        """(n,), m: distances below it are exact."""
+        return np.where(inside, self.reach + 0.5 + _FIELD_SPACING, STRAY) * self.spacing
+
+    @staticmethod
+    def _solid(surface: Surface, open_regions: tuple[int, ...]) -> Surface:
+        """The closed part of the wall."""
+        shut = ~np.isin(surface.region, open_regions)
+        return Surface(surface.vertices, surface.faces[shut], surface.region[shut])
 
     def _inside(self, surface: Surface, time: float) -> np.ndarray:
         """(n,) bool: nodes inside the walls; remembered for the next set of open valves at the same time."""
@@ -206,5 +232,5 @@ def _open_channel(
 def _normals(distance: Tensor) -> Tensor:
     """Unit gradient of the distance (D, *shape), components x, y, z."""
     gradient = torch.stack(torch.gradient(distance)[::-1])
-    length = gradient.square().sum(0).sqrt_()
-    return gradient.div_(length.clamp_min_(1e-12))
+    length = gradient.square().sum(0).clamp_min(1e-24).sqrt()
+    return gradient / length

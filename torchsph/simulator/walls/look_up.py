@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Callable
+from copy import copy
 
 import torch
 from torch import Tensor
@@ -49,6 +50,19 @@ class LookUp:
         self._origin = [value / unit for value in grid.origin]
         self._step = [value / unit for value in grid.spacing]
         self._place = [early.new_tensor(values) for values in (self._origin, self._step, [n - 2 for n in self._counts])]
+
+    @property
+    def variable(self) -> Tensor | None:
+        """(nodes, channels of both times), where torch is to differentiate the fields; None where it is not."""
+        if not any(rows.requires_grad for rows in self._rows):
+            return None
+        return self._side_by_side()
+
+    def with_variable(self, rows: Tensor) -> LookUp:
+        """The same look-up of other fields, given as ``variable`` has them."""
+        other = copy(self)
+        other._rows, other._both = [rows], rows
+        return other
 
     def at(self, points: Tensor, fraction: Tensor) -> Tensor:
         """Values at points.
@@ -99,9 +113,12 @@ class LookUp:
         )
         return out
 
-    def _by_torch(self, points: Tensor, fraction: Tensor) -> Tensor:
+    def _side_by_side(self) -> Tensor:
         if self._both is None:
             self._both = self._rows[0] if self.steady else torch.cat(self._rows, 1)
+        return self._both
+
+    def _by_torch(self, points: Tensor, fraction: Tensor) -> Tensor:
         origin, step, last = self._place
         place = (points - origin) / step
         finite = torch.nan_to_num(place, nan=0.0, posinf=0.0, neginf=0.0)
@@ -112,7 +129,7 @@ class LookUp:
         for axis in range(1, points.shape[1]):
             strides.append(strides[-1] * self._counts[axis - 1])
             node = node + low[:, axis].to(torch.int64) * strides[axis]
-        value = self._along(self._both, points.shape[1] - 1, node, share, strides)
+        value = self._along(self._side_by_side(), points.shape[1] - 1, node, share, strides)
         if self.steady:
             return value
         weight = fraction[:, None] if fraction.ndim else fraction
