@@ -37,13 +37,13 @@ def usable_device(name: str) -> str:
         raise ValueError(f"--device: {fault}") from fault
 
 
-def check_spacing(spacing: float | None, recording: geometry.Recording) -> None:
+def check_spacing(spacing: float | None, recording: geometry.Recording, option: str = "--spacing") -> None:
     """A spacing in millimetres is the likeliest slip: it leaves no room for a particle."""
-    vertices = recording.wall_for("--spacing").at(0).vertices
+    vertices = recording.wall_for(option).at(0).vertices
     narrowest = float(np.ptp(vertices, axis=0).min())
     if spacing is not None and spacing > narrowest / 3:
         raise ValueError(
-            f"--spacing: {spacing:g} m leaves fewer than 3 particles across the walls ({narrowest:.3g} m); "
+            f"{option}: {spacing:g} m leaves fewer than 3 particles across the walls ({narrowest:.3g} m); "
             "it is in metres, 1 mm is 0.001"
         )
 

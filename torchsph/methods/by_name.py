@@ -20,7 +20,7 @@ from .measurement.frame_splines import CHOICE_EVERY
 from .measurement.prepared import PreparedMeasurement
 from .memory import MemoryPrediction, free_memory, predicted
 from .methods_run import METHODS, MethodResult, MethodsRun
-from .models import CONTROL_SHARE, Models, analysis_spacing, make_model
+from .models import Models, make_model
 from .runtime.checkpoint import Saved
 from .runtime.parallel import is_lead
 from .runtime.watching import Watcher
@@ -55,13 +55,14 @@ def make_smoother(preset: str) -> regularize.Smoother:
     return regularize.Smoother.preset("thesis" if preset == "thesis" else "default")
 
 
-@checked(spacing=SPACING, members=between(1, MOST_MEMBERS), workers=between(1, MOST_WORKERS))
+@checked(spacing=SPACING, control_spacing=SPACING, members=between(1, MOST_MEMBERS), workers=between(1, MOST_WORKERS))
 def run_methods(
     measured: geometry.Recording,
     methods: Sequence[str],
     *,
     preset: str = "default",
     spacing: float | None = None,
+    control_spacing: float | None = None,
     members: int | None = None,
     also: Sequence[geometry.Recording] = (),
     truth: geometry.Recording | None = None,
@@ -80,12 +81,12 @@ def run_methods(
     """Run methods by name on one measurement, in the order of ``METHODS``.
 
     "free", the run without data, comes along with every method that simulates. ``spacing`` (m) of the particles
-    defaults to ``ANALYSIS_SPACING`` grid spacings, half of it in the ensemble's control run; ``members`` to
-    ``DEFAULT_MEMBERS``. ``also``, ``truth``, ``lag``, ``minimum_members``, ``checkpoints``, ``resume`` and ``watcher``
-    are the ensemble's (``assimilate``, ``EnsembleOptions``); the other methods know one measurement. The seconds of a
-    method include the spline that it starts from only where "spline" itself was not asked for. ``quantities`` names the
-    methods whose members are read out ("ensemble", and "spline" by as many draws as members); ``keep_members`` is the
-    file to which the ensemble's are written.
+    defaults to ``ANALYSIS_SPACING`` grid spacings, ``control_spacing``, of the ensemble's control run, to half of it;
+    ``members`` to ``DEFAULT_MEMBERS``. ``also``, ``truth``, ``lag``, ``minimum_members``, ``checkpoints``, ``resume``
+    and ``watcher`` are the ensemble's (``assimilate``, ``EnsembleOptions``); the other methods know one measurement.
+    The seconds of a method include the spline that it starts from only where "spline" itself was not asked for.
+    ``quantities`` names the methods whose members are read out ("ensemble", and "spline" by as many draws as members);
+    ``keep_members`` is the file to which the ensemble's are written.
 
     ``workers`` processes of one thread each, this one among them, share the splines and the ensemble, with the same
     result to the last bit for any number; "free" and "sph" have one each. None: as many as this process may use cores,
@@ -101,9 +102,10 @@ def run_methods(
     if not methods:
         return {}
     prepared = PreparedMeasurement(measured, make_smoother(preset), progress=progress)
-    models = Models(prepared, preset, spacing, device)
+    models = Models(prepared, preset, spacing, device, control_spacing)
     count = DEFAULT_MEMBERS if members is None else members
-    foretold, free = predicted_memory(prepared, methods, preset, models.spacing, count, also), free_memory()
+    foretold = predicted_memory(prepared, methods, preset, models.spacing, count, also, models.control_spacing)
+    free = free_memory()
     options = EnsembleOptions(lag=lag, minimum_members=minimum_members)
     tasks = parallel_tasks(measured.frames, methods, count, options.batch) if device == "cpu" else 1
     processes = chosen_workers(workers, tasks, lambda number: foretold.in_processes(number).fits(free))
@@ -144,13 +146,15 @@ def predicted_memory(
     spacing: float | None = None,
     members: int = DEFAULT_MEMBERS,
     also: Sequence[geometry.Recording] = (),
+    control_spacing: float | None = None,
 ) -> MemoryPrediction:
     """What ``run_methods`` with the same options will take."""
-    spacing = analysis_spacing(prepared, spacing)
+    models = Models(prepared, preset, spacing, "cpu", control_spacing)  # makes none of them
+    spacing = models.spacing
     simulated = set(methods) - {"spline"}
     runs = [(spacing, 1)] if simulated else []
     if "ensemble" in methods:
-        runs = [(spacing, min(members, EnsembleOptions().batch)), (CONTROL_SHARE * spacing, 1)]
+        runs = [(spacing, min(members, EnsembleOptions().batch)), (models.control_spacing, 1)]
     return predicted(
         prepared.recording,
         scheme_preset(preset),

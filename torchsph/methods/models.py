@@ -55,13 +55,21 @@ def analysis_spacing(prepared: PreparedMeasurement, asked: float | None) -> floa
 class Models:
     """The simulators of a measurement, each made when it is first asked for."""
 
-    def __init__(self, prepared: PreparedMeasurement, preset: str, spacing: float | None, device: str) -> None:
+    def __init__(
+        self,
+        prepared: PreparedMeasurement,
+        preset: str,
+        spacing: float | None,
+        device: str,
+        control_spacing: float | None = None,
+    ) -> None:
         self.prepared, self.preset, self.device = prepared, preset, device
         self.spacing = analysis_spacing(prepared, spacing)
+        self.control_spacing = CONTROL_SHARE * self.spacing if control_spacing is None else control_spacing
 
     def anew(self) -> Models:
         """The same, none of them made yet."""
-        return Models(self.prepared, self.preset, self.spacing, self.device)
+        return Models(self.prepared, self.preset, self.spacing, self.device, self.control_spacing)
 
     @cached_property
     def coarse(self) -> Simulator:
@@ -71,7 +79,7 @@ class Models:
     @cached_property
     def fine(self) -> Simulator:
         """Of the ensemble's control."""
-        return self._at(CONTROL_SHARE * self.spacing)
+        return self._at(self.control_spacing)
 
     def _at(self, spacing: float) -> Simulator:
         found = self.prepared.splines.estimates

@@ -37,6 +37,7 @@ class PresentSurroundings:
         valve_acceleration: (N, D), the last one by pressure sources, internal, for the account of their work; None
             while all valves are shut.
         exchange_field: what comes in through a plane cut out of a flow, as the last imposed field has it, or None.
+        fields: of the walls in the interval; None: there are no walls, or nothing was entered yet.
         displacement: of the walls, from the next ``enter`` on; None: they are where the scene has them.
     """
 
@@ -48,22 +49,12 @@ class PresentSurroundings:
         self.displacement: WallDisplacement | None = None
         self._bracket: tuple[float, float] = (0.0, 1.0)
         self._keys: tuple[Tensor, Tensor] | None = None
-        self._fields: LookUp | None = None
+        self.fields: LookUp | None = None
 
     @property
     def entered(self) -> bool:
         """Whether there are walls to look up: an interval was entered, and the scene has some."""
-        return self._fields is not None
-
-    @property
-    def wall_variable(self) -> Tensor | None:
-        """The walls' fields, where torch is to differentiate them (``LookUp.variable``)."""
-        return None if self._fields is None else self._fields.variable
-
-    def use_wall_variable(self, rows: Tensor) -> None:
-        """Look walls up in other fields, given as ``wall_variable`` has them, where these are to be differentiated."""
-        if self._fields is not None and rows.requires_grad:
-            self._fields = self._fields.with_variable(rows)
+        return self.fields is not None
 
     def enter(self, start: float, stop: float, *, shut: bool = False) -> None:
         """Choose key frames and open valves for an interval (s) without breaks inside.
@@ -78,7 +69,7 @@ class PresentSurroundings:
         if domain.walls is not None:
             self._bracket, keys = domain.wall_keys(middle, open_regions, self.displacement)
             if self._keys is None or keys[0] is not self._keys[0] or keys[1] is not self._keys[1]:
-                self._keys, self._fields = keys, domain.walls.between(*keys)
+                self._keys, self.fields = keys, domain.walls.between(*keys)
         self.clock.enter(start, stop, open_regions, self.valve_strength)
 
     def at(self, times: Tensor | float) -> None:
@@ -129,9 +120,9 @@ class PresentSurroundings:
 
     def _look_up(self, position: Tensor, fraction: Tensor) -> WallSample:
         """Walls at points (n, D), ``fraction`` () or (n,) of the way from the earlier fields to the later ones."""
-        if self.domain.walls is None or self._fields is None:
+        if self.domain.walls is None or self.fields is None:
             raise ValueError("there are no walls to look up: the scene has none, or no interval was entered")
-        return self.domain.walls.sample(self._fields, fraction, self.domain.wrapped(position))
+        return self.domain.walls.sample(self.fields, fraction, self.domain.wrapped(position))
 
     def body_force(self, particles: Particles) -> Tensor | None:
         """Acceleration (N, D) by gravity and pressure sources, or None."""

@@ -321,6 +321,11 @@ FAULTS = {
     "negative spacing": (["assimilate", "{measured}", "--spacing", "-0.001"], "must be above 0"),
     "spacing not a number": (["assimilate", "{measured}", "--spacing", "nan"], "must be above 0"),
     "spacing in millimetres": (["assimilate", "{measured}", "--spacing", "1"], "in metres"),
+    "control in millimetres": (["assimilate", "{measured}", "--control-spacing", "1"], "--control-spacing: 1 m leaves"),
+    "control and budget": (
+        ["assimilate", "{measured}", "--control-spacing", "1e-3", "--budget", "9"],
+        "leave --control-spacing out",
+    ),
     "one member": (["assimilate", "{measured}", "--members", "1"], "at least 2"),
     "broken number": (["assimilate", "{measured}", "--seed", "one"], "not a whole number"),
     "negative seed": (["assimilate", "{measured}", "--seed", "-1"], "at least 0"),

@@ -15,6 +15,7 @@ from torchsph.cli import main
 from torchsph.cli.commands import smooth
 from torchsph.methods import by_name
 from torchsph.methods.memory import MemoryPrediction, NotEnoughMemory, _control_group, free_memory
+from torchsph.methods.models import Models
 
 GB = 10**9
 
@@ -79,6 +80,10 @@ def test_every_setting_counts_as_it_should(measured):
     assert of(spacing=2e-3, members=32).members == 2 * plain.members
     assert of(spacing=1e-3).particles == pytest.approx(8 * plain.particles, rel=1e-3)  # counts of whole particles
     assert of(spacing=1e-3).tables > 2 * plain.tables
+    control = of(spacing=2e-3, control_spacing=1e-3)
+    assert (control.particles, control.tables) == (plain.particles, plain.tables)  # half of the members' already
+    assert of(spacing=2e-3, control_spacing=5e-4).tables > plain.tables
+    assert Models(prepared, "default", 2e-3, "cpu", 7e-4).anew().fine.scene.spacing == 7e-4
     assert of(spacing=2e-3, also=[measured]).recordings > plain.recordings
 
 

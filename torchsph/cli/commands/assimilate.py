@@ -24,7 +24,7 @@ from torchsph.methods.runtime import checkpoint, parallel
 from torchsph.methods.runtime.workers import chosen_workers
 from torchsph.report import write_report
 
-from ..arguments import add_model_options, add_output_folder, add_seed, add_sidecar, add_workers, names, whole
+from ..arguments import add_model_options, add_output_folder, add_seed, add_sidecar, add_workers, names, number, whole
 from ..budget import NAME as SPACING_FILE
 from ..budget import chosen_spacing
 from ..checks import check_spacing, informative, usable_device
@@ -66,6 +66,12 @@ def add_method_options(parser: argparse.ArgumentParser) -> None:
     """What is run, and how: the options that do not name a file."""
     parser.add_argument("--method", type=names, metavar="NAME[,NAME]", help="free, spline, sph, ensemble")
     add_model_options(parser)
+    parser.add_argument(
+        "--control-spacing",
+        type=number(0, open_below=True),
+        metavar="M",
+        help="of the particles of the ensemble's control run, m (half of the members')",
+    )
     parser.add_argument("--members", type=whole(2), metavar="N", help="size of the ensemble")
     parser.add_argument(
         "--lag", type=whole(1), metavar="N", help="frames whose data still move the ensemble's earlier analyses (off)"
@@ -101,16 +107,14 @@ def assimilate(args: argparse.Namespace) -> None:
     held = locked(folder) if lead else nullcontext(folder)
     with held, StatusFile(args.status if lead else None) as status, StopSignals() as signals:
         account = provenance(args, {"measurement": measured_path, "truth": truth_path, "also": args.also})
-        measured = informative(geometry.read_recording(measured_path), measured_path)
-        also = [informative(geometry.read_recording(path), path) for path in args.also]
-        if args.beats:
-            (measured, *also), _ = stitched([measured, *also])
+        measured, *also = _measurements(measured_path, args)
         truth = None if truth_path is None else geometry.read_recording(truth_path)
         kept = folder / SPACING_FILE if "ensemble" in methods and lead else None
         if not args.resume and kept is not None:
             kept.unlink(missing_ok=True)
         bought = chosen_spacing(args, partial(_afforded, measured, methods, args), kept)
         check_spacing(args.spacing, measured)
+        check_spacing(args.control_spacing, measured, "--control-spacing")
         read_out = methods_read_out(args, methods, measured)
         with about(str(truth_path or measured_path)):  # first: a truth that does not fit must not cost a run
             raw = metrics.evaluate(measured, truth, measured)
@@ -123,6 +127,7 @@ def assimilate(args: argparse.Namespace) -> None:
                 methods,
                 preset=args.preset,
                 spacing=args.spacing,
+                control_spacing=args.control_spacing,
                 members=args.members,
                 lag=args.lag,
                 minimum_members=args.minimum_members,
@@ -150,6 +155,12 @@ def assimilate(args: argparse.Namespace) -> None:
         if "ensemble" in methods:
             saved.unlink(missing_ok=True)  # the run is complete: there is nothing to go on with
             (folder / SPACING_FILE).unlink(missing_ok=True)
+
+
+def _measurements(path: Path, args: argparse.Namespace) -> Sequence[geometry.Recording]:
+    """The measurement and all further ones of the same beat."""
+    every = [informative(geometry.read_recording(one), one) for one in (path, *args.also)]
+    return stitched(every)[0] if args.beats else every
 
 
 def _afforded(
@@ -285,6 +296,8 @@ def _inputs(args: argparse.Namespace) -> tuple[Path, Path | None, tuple[str, ...
     else:
         measured, truth = Path(args.measurement), None if args.truth is None else Path(args.truth)
         methods = args.method or (by_name.DEFAULT_METHOD,)
+    if args.budget is not None and args.control_spacing is not None:
+        raise ValueError("--budget chooses the spacing: leave --control-spacing out, or leave --budget out")
     unknown = [name for name in methods if name not in by_name.METHODS]
     members = by_name.DEFAULT_MEMBERS if args.members is None else args.members
     if members < (args.minimum_members or 0):

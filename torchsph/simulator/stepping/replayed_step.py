@@ -107,7 +107,8 @@ class Step:
         found["clock.valve_strength"] = clock.valve_strength
         if clock.flux_split is not None:
             found["split.flux"] = clock.flux_split.flux
-        found["walls.fields"] = self.surroundings.wall_variable
+        walls = self.surroundings.fields
+        found["walls.fields"] = None if walls is None else walls.variable
         return {name: value for name, value in found.items() if isinstance(value, Tensor)}
 
     def _apart(self) -> Step:
@@ -131,8 +132,9 @@ class Step:
         around = copy(step.surroundings)
         around.clock = clock = copy(around.clock)
         _give(clock, groups["clock"], groups["split"])
-        if groups["walls"]:
-            around.use_wall_variable(groups["walls"]["fields"])
+        rows = groups["walls"].get("fields")
+        if around.fields is not None and rows is not None and rows.requires_grad:
+            around.fields = around.fields.with_variable(rows)
         stepper = step.stepper
         if groups["coefficients"]:
             stepper = stepper.apart(coefficients, step.record)

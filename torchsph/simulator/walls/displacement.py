@@ -1,7 +1,7 @@
 """Walls a little off where their scene has them, as a variable that torch can differentiate.
 
 A wall that moves outwards by a along its normal makes the distance of a point of the fluid larger by the a of the wall
-place nearest to it: to first order that place stays (the envelope theorem; Delfour & Zolesio 2011, ch. 7, sec. 3). What
+place nearest to it: to first order that place stays (the envelope theorem; Delfour & Zolesio 2011, ch. 7). What
 particles see of the walls follows from the distances as it does for walls that stay.
 """
 
