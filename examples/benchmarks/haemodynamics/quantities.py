@@ -1,14 +1,16 @@
 """What people read out of a flow, against a truth: raw, splines, ensemble, members, and the formulas alone.
 
     torchsph assimilate MEASURED.h5 --method spline,ensemble [--keep-members] --out RUN
-    python examples/benchmarks/haemodynamics/quantities.py TRUTH.h5 MEASURED.h5 RUN [--tracers 20000] [--json FILE]
+    torchsph assimilate MEASURED.h5 --method spline --quantities --out DRAWN
+    python examples/benchmarks/haemodynamics/quantities.py TRUTH.h5 MEASURED.h5 RUN [--draws DRAWN] [--tracers 20000]
+        [--json FILE]
 
 Curves: root mean square error over the root mean square of the true curve. The truth is these formulas on all frames of
 the true velocities; for all that is of the pressure it is the CFD's own. "formula" is the formulas on the true
 velocities at the measurement's frames: what they cost by themselves. "members" is the mean over the ensemble's members,
 whose du/dt comes from their forecasts; "simulator" the projection's pressure. Coverage: share of frames that the
 members' 90 % band holds. Members are those of `members.h5` where they were kept, else what `quantities.json` says of
-them, which leaves out their fields of pressure.
+them, which leaves out their fields of pressure. "draws" are those from the splines' posterior, of a run of theirs.
 """
 
 from __future__ import annotations
@@ -154,12 +156,17 @@ def kept_members(run: Path, analysis: geometry.Recording, frames: list[FrameQuan
     return Members(read.found().bands(), {name: np.stack(parts) for name, parts in fields})
 
 
-def noted_members(run: Path, analysis: geometry.Recording, own: np.ndarray) -> Members:
-    """What the run noted of them; where the simulator gives no pressure, the formula's `own` stands in."""
+def noted_bands(run: Path) -> dict[str, Summary]:
+    """Bands of the curves of members, or of draws, as a run noted them."""
     noted = json.loads((run / "quantities.json").read_text(encoding="utf-8"))["members"]["curves"]
-    bands = {
+    return {
         name: Summary(*(np.array(curve[part], np.float64) for part in Summary._fields)) for name, curve in noted.items()
     }
+
+
+def noted_members(run: Path, analysis: geometry.Recording, own: np.ndarray) -> Members:
+    """What the run noted of them; where the simulator gives no pressure, the formula's `own` stands in."""
+    bands = noted_bands(run)
     found = np.asarray(analysis.pressure, np.float64)
     return Members(bands, {"simulator": np.where(np.isfinite(found), found, own)})
 
@@ -167,8 +174,12 @@ def noted_members(run: Path, analysis: geometry.Recording, own: np.ndarray) -> M
 class Comparison:
     """A truth, a measurement of it, and what a run made of that."""
 
-    def __init__(self, truth: Path, measured: Path, run: Path) -> None:
-        self.run, self.every, self.measured = run, geometry.read_recording(truth), geometry.read_recording(measured)
+    def __init__(self, truth: Path, measured: Path, run: Path, draws: Path | None = None) -> None:
+        self.draws, self.run, self.every, self.measured = (
+            run,
+            geometry.read_recording(truth),
+            geometry.read_recording(measured),
+        )
         self.spline = geometry.read_recording(run / "spline.h5")
         self.ensemble = geometry.read_recording(run / "ensemble.h5")
         self.chosen = matching_frames(self.measured.time, self.every.time, "the truth")
@@ -192,6 +203,9 @@ class Comparison:
             bands, more = noted_members(self.run, self.ensemble, fields["ensemble"])
         fields |= more
         curves["members"] = {name: band.mean for name, band in bands.items()}
+        drawn = {} if self.draws is None else noted_bands(self.draws)
+        if drawn:
+            curves["draws"] = {name: band.mean for name, band in drawn.items()}
         spins = {name: field_error(one.vorticity, whole.vorticity[self.chosen], mask) for name, one in sources.items()}
         return {
             "curves": {c: {name: off(each[c], right[c]) for name, each in curves.items()} for c in CURVES},
@@ -202,6 +216,7 @@ class Comparison:
             **self._differences(frames, all_frames, fields, bands["pressure_difference"].mean),
             "numbers": self._numbers(whole.curves, curves),
             "coverage": {name: coverage(bands[name], right[name]) for name in UNITS if name != "volume"},
+            "coverage of draws": {name: coverage(drawn[name], right[name]) for name in drawn if name != "volume"},
         }
 
     def _differences(
@@ -252,12 +267,13 @@ def main() -> None:
     parser.add_argument("truth", type=Path)
     parser.add_argument("measured", type=Path)
     parser.add_argument("run", type=Path, help="with spline.h5, ensemble.h5, and members.h5 or quantities.json")
+    parser.add_argument("--draws", type=Path, metavar="DRAWN", help="a run of splines alone, with quantities.json")
     parser.add_argument("--tracers", type=int, default=20_000)
     parser.add_argument("--only", choices=("fields", "components"), help="one half, beside the other in the JSON file")
     parser.add_argument("--json", type=Path, help="results file, read and updated")
     options = parser.parse_args()
     torch.set_num_threads(1)
-    given = Comparison(options.truth, options.measured, options.run)
+    given = Comparison(options.truth, options.measured, options.run, options.draws)
     there = options.json is not None and options.json.exists()
     result = json.loads(options.json.read_text(encoding="utf-8")) if there else {}
     result.pop("from", None)  # of the table that this one takes the place of
