@@ -216,7 +216,7 @@ class Comparison:
             **self._differences(frames, all_frames, fields, bands["pressure_difference"].mean),
             "numbers": self._numbers(whole.curves, curves),
             "coverage": {name: coverage(bands[name], right[name]) for name in UNITS if name != "volume"},
-            "coverage of draws": {name: coverage(drawn[name], right[name]) for name in drawn if name != "volume"},
+            **({"coverage of draws": {name: coverage(drawn[name], right[name]) for name in right}} if drawn else {}),
         }
 
     def _differences(

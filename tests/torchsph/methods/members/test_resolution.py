@@ -53,7 +53,7 @@ def test_a_second_pass_takes_at_most_what_the_first_took(largest, slope):
     whole, once, twice = (float(f.square().sum()) for f in (true, seen, again))
     shown = float(unresolved(once, [once, once], twice))
     assert 1.0 < (whole - once) / shown < 5.0 and once > whole / 3
-    # half of it is added, so that a field which lacks nothing gets too much by less than one that lacks all got too little
+    # half of it is added: a field that lacks nothing gets too much by less than one that lacks all had too little
     better, full = once + float(missing(once, twice)), whole + float(missing(whole, once))
     assert once < better < whole < full and full - whole < whole - once
 
