@@ -29,8 +29,7 @@ Curves = dict[str, NDArray[np.float64]]
 
 CAUTION = (
     "At 1 mm and 10 ms do not believe as they stand: wall shear stress, energy loss and vorticity (too small in smooth "
-    "fields, too large in raw ones), helicity; the kinetic energy of the analysis alone is too small by a quarter, the "
-    "members' mean by a few percent. Members' bands count "
+    "fields, too large in raw ones), helicity; kinetic energy is too small by about an eighth. Members' bands count "
     "what is finer than the measurement shows; of helicity, force and pressure they hold three in four. For research, "
     "not for clinical use."
 )
