@@ -27,7 +27,7 @@ from .lagrangian.tracers import Tracers, carry, residence_time, seed_blood
 from .plane_quantities import CUT_UNITS, PLANE_UNITS, PlaneQuantities
 from .pressure import PressureSolver, pressure_difference, region_mean
 from .quantities import UNITS, Catalogue, FrameQuantities, catalogue, flow_quantities
-from .uncertainty import RunningMoments, Summary, around, coverage, missing, summary, unresolved
+from .uncertainty import RunningMoments, Summary, around, coverage, summary, unresolved
 from .vortices import PlaneCore, PlaneVortex, VortexRing, main_vortex, plane_cores, vortex_cores, vortex_ring
 from .vorticity import helicity_density, lambda2, q_criterion, swirl, vorticity
 from .wall_shear import WallShear
@@ -82,7 +82,6 @@ __all__ = [
     "long_axis",
     "main_vortex",
     "material_acceleration",
-    "missing",
     "plane_beat_numbers",
     "plane_circulation",
     "plane_cores",

@@ -42,13 +42,6 @@ UNITS = {
 """Quantities per frame; flows are positive in the direction of their valve: in at the inlet, out at the outlet."""
 
 
-SQUARES = frozenset(
-    ("kinetic_energy", "kinetic_energy_density", "energy_loss", "vorticity_rms", "speed_rms")
-    + ("energy_lost", "kinetic_energy_mean", "kinetic_energy_peak")
-)
-"""Sums of squares of the velocity or of its gradient, and roots of such, in space and in planes."""
-
-
 class FrameQuantities(DomainFrame):
     """The quantities of one frame, for any number of fields.
 
@@ -97,14 +90,12 @@ class Catalogue(NamedTuple):
         beat_units: of its numbers of the beat.
         frame: computes the quantities of one frame.
         beat: makes the numbers of the beat of their curves.
-        squares: names of the quantities and numbers that are sums of squares, to which missing detail only adds.
     """
 
     units: Mapping[str, str]
     beat_units: Mapping[str, str]
     frame: Callable[[FlowDomain, int, geometry.WallSampler | None], FrameQuantities | PlaneQuantities]
     beat: Callable[[ArrayLike, Mapping[str, ArrayLike]], dict[str, Array]]
-    squares: frozenset[str] = SQUARES
 
 
 def catalogue(dimension: int = 3, cut: bool = False) -> Catalogue:

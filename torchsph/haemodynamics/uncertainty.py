@@ -13,10 +13,6 @@ of a quantity lies there, and the larger counts as a deviation that all members 
 variance adds to a quadratic of their mean, a correction that is as uncertain as it is large; and what the measurement's
 kernel takes from the quantity when the estimate is put through it once more (after Roache 1994, who judges a solution
 by what it loses on a coarser grid).
-
-To a sum of squares (an energy, the loss, the size of the vorticity) missing detail can only add. Nothing is missing
-where the estimate has won all of it back, and no less than what the second pass takes where it has won none: the middle
-of the two is added to every member (`missing`).
 """
 
 from __future__ import annotations
@@ -28,7 +24,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import stdtrit
 
-__all__ = ["RunningMoments", "Summary", "around", "coverage", "missing", "summary", "unresolved"]
+__all__ = ["RunningMoments", "Summary", "around", "coverage", "summary", "unresolved"]
 
 Array = NDArray[np.float64]
 
@@ -74,16 +70,6 @@ def unresolved(estimate: ArrayLike, members: ArrayLike, coarser: ArrayLike | Non
     alone = np.asarray(estimate, np.float64)
     added = np.abs(np.asarray(members, np.float64).mean(0) - alone)
     return added if coarser is None else np.maximum(added, np.abs(alone - np.asarray(coarser, np.float64)))
-
-
-def missing(estimate: ArrayLike, coarser: ArrayLike) -> Array:
-    """How much detail below the measurement's resolution adds to a sum of squares, `(...)`, in its own unit; 0 or more.
-
-    Args:
-        estimate: the quantity of the estimate, `(...)`.
-        coarser: of the estimate put through the measurement's kernel once more, `(...)`.
-    """
-    return 0.5 * np.maximum(np.asarray(estimate, np.float64) - np.asarray(coarser, np.float64), 0.0)
 
 
 def around(control: ArrayLike, members: ArrayLike, scale: ArrayLike = 1.0) -> Array:

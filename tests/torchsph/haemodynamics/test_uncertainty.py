@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from torchsph.haemodynamics.uncertainty import RunningMoments, around, coverage, missing, summary, unresolved
+from torchsph.haemodynamics.uncertainty import RunningMoments, around, coverage, summary, unresolved
 
 
 @pytest.mark.parametrize("members", [4, 16, 64])
@@ -33,10 +33,6 @@ def test_what_members_lack_together_widens_the_band():
     # the larger of what the variance adds to the estimate's and of what a second pass takes
     assert unresolved([2.0, 3.5], values).tolist() == [1.0, 0.5]
     assert unresolved([2.0, 3.5], values, [1.5, 1.0]).tolist() == [1.0, 2.5]
-
-
-def test_to_a_sum_of_squares_half_of_what_a_second_pass_takes_is_added():
-    assert missing([3.0, 2.0], [2.0, 2.5]).tolist() == [0.5, 0.0]
 
 
 def test_a_band_holds_nine_of_ten_of_what_all_members_miss():

@@ -15,7 +15,7 @@ import geometry
 from torchsph.haemodynamics.domain import PROBE, DomainFrame, FlowDomain
 from torchsph.haemodynamics.pressure import region_mean
 from torchsph.haemodynamics.quantities import Catalogue, catalogue
-from torchsph.haemodynamics.uncertainty import Summary, missing, summary, unresolved
+from torchsph.haemodynamics.uncertainty import Summary, summary, unresolved
 
 from .frames import MemberFrame
 
@@ -53,7 +53,7 @@ class MemberCurves:
 
     def bands(self) -> dict[str, Summary]:
         """Mean, deviation and band of every curve."""
-        return self._bands(self.estimate, self.members, self.coarser)
+        return _bands(self.estimate, self.members, self.coarser)
 
     def beat(self) -> dict[str, Array]:
         """Numbers of the beat of the analysis."""
@@ -62,18 +62,7 @@ class MemberCurves:
     def beat_bands(self) -> dict[str, Summary]:
         """Mean, deviation and band of the numbers of the beat."""
         coarser = None if self.coarser is None else self.kind.beat(self.time, self.coarser)
-        return self._bands(self.beat(), self.kind.beat(self.time, self.members), coarser)
-
-    def _bands(
-        self, estimate: Mapping[str, Array], members: Mapping[str, Array], coarser: Mapping[str, Array] | None
-    ) -> dict[str, Summary]:
-        """A band for each quantity, as wide as members lie apart and as what they all lack is large."""
-        bands = {}
-        for name, values in members.items():
-            alone, lost = estimate[name], None if coarser is None else coarser[name]
-            more = missing(alone, lost) if lost is not None and name in self.kind.squares else 0.0
-            bands[name] = summary(values + more, unresolved(alone, values, lost))
-        return bands
+        return _bands(self.beat(), self.kind.beat(self.time, self.members), coarser)
 
 
 class MemberQuantities:
@@ -185,6 +174,16 @@ def stacked(frame: MemberFrame) -> tuple[NDArray[np.floating], NDArray[np.floati
     if frame.coarser is not None and frame.coarser_rate is not None:
         velocity, rate = [*velocity, frame.coarser[None]], [*rate, frame.coarser_rate[None]]
     return np.concatenate(velocity), np.concatenate(rate)
+
+
+def _bands(
+    estimate: Mapping[str, ArrayLike], members: Mapping[str, ArrayLike], coarser: Mapping[str, ArrayLike] | None
+) -> dict[str, Summary]:
+    """A band for each quantity, as wide as members lie apart and as what they all lack is large."""
+    return {
+        name: summary(values, unresolved(estimate[name], values, None if coarser is None else coarser[name]))
+        for name, values in members.items()
+    }
 
 
 def with_pressure(recording: geometry.Recording, curves: MemberCurves | None) -> geometry.Recording:
