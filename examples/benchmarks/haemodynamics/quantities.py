@@ -175,11 +175,8 @@ class Comparison:
     """A truth, a measurement of it, and what a run made of that."""
 
     def __init__(self, truth: Path, measured: Path, run: Path, draws: Path | None = None) -> None:
-        self.draws, self.run, self.every, self.measured = (
-            run,
-            geometry.read_recording(truth),
-            geometry.read_recording(measured),
-        )
+        self.run, self.draws = run, draws
+        self.every, self.measured = geometry.read_recording(truth), geometry.read_recording(measured)
         self.spline = geometry.read_recording(run / "spline.h5")
         self.ensemble = geometry.read_recording(run / "ensemble.h5")
         self.chosen = matching_frames(self.measured.time, self.every.time, "the truth")

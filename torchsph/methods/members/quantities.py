@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 import geometry
 from torchsph.haemodynamics.domain import PROBE, DomainFrame, FlowDomain
