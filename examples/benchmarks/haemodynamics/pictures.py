@@ -1,7 +1,7 @@
 """Pressure and pathlines of an analysis beside the truth's, in a plane through both valves.
 
     torchsph assimilate MEASURED.h5 --out RUN
-    python examples/benchmarks/haemodynamics/pictures.py TRUTH.h5 RUN/ensemble.h5 [--out FOLDER]
+    python examples/benchmarks/haemodynamics/pictures.py TRUTH.h5 RUN/ensemble.h5 [--out results]
 
 `pressure.png`: mid-ejection, the E wave and the A wave, each truth, analysis and their difference, with the mean of
 every picture set to 0. `pathlines.png`: the same tracers from the base at the opening of the inlet, as far as the end
@@ -25,6 +25,7 @@ from matplotlib.collections import LineCollection
 sys.path.insert(0, str(Path(__file__).resolve().parents[3]))
 
 import geometry
+from examples.figures.style import save
 from torchsph.evaluation.frames import matching_frames
 from torchsph.evaluation.metrics import filled_velocity
 from torchsph.haemodynamics.lagrangian.moving_flow import MovingFlow, MovingWalls
@@ -77,7 +78,7 @@ def draw_pressure(truth: geometry.Recording, analysis: geometry.Recording, path:
     for axis in axes[-1]:
         axis.set_xlabel("x, mm")
     figure.suptitle("pressure less its mean", fontsize=11)
-    figure.savefig(path, dpi=110)
+    save(figure, path)
 
 
 def paths_of(recording: geometry.Recording, walls: MovingWalls, seeds: torch.Tensor, times: np.ndarray) -> np.ndarray:
@@ -120,7 +121,7 @@ def draw_paths(truth: geometry.Recording, analysis: geometry.Recording, path: Pa
     figure.suptitle(
         f"{len(seeds)} tracers from the base, from {MM * inlet:.0f} ms; {spans}at the end {np.median(apart[-1]):.1f} mm"
     )
-    figure.savefig(path, dpi=110)
+    save(figure, path)
 
 
 def main() -> None:
