@@ -19,11 +19,10 @@ wall seconds are those of the steps alone, for the ventricle of the whole foreca
 
 Measured (results/speed_error.json and .png; the ventricle is a CFD phantom, one core of two in use by other work):
 
-- ventricle: the projection and the weakly compressible preset make the same error (.547 .461 .408 and .547 .455 .404 of
-  persistence's at 1.5, 1.2 and 1 mm) for .58, .53 and .60 of the time, starts counted, and at 1 mm walls' tables, most
-  of it: those of a beat do not fit into the memory that they may take. Of the steps alone it takes .39 there.
-  Steps to 1 ms cost .68 of those to 0.7 ms for 2 to 3 % more error, steps to 0.5 ms 1.1 for 1 % less. Sound speed 3.5
-  costs .8 of the preset's and is as good, 10 is worse for more; gamma from 1 to 7 is slightly worse.
+- ventricle: the projection and the weakly compressible preset make the same error (.315 .267 .236 and .326 .262 .242 of
+  persistence's at 1.5, 1.2 and 1 mm) for .64, .57 and .49 of the time, starts counted. Steps to 1 ms cost .76 to .95 of
+  those to 0.7 ms for 3 to 7 % more error, steps to 0.5 ms 1.01 to 1.12 for 1 to 4 % less. Sound speed 3.5 costs .70 to
+  .78 of the preset's and is as good, 10 is worse for more; gamma from 1 to 7 makes no difference.
 - ellipsoid: .084 .056 .044 by projection, .093 .071 .065 weakly compressible, in half of the time.
 - plane: .0065 and .0056 at 40^2 and 60^2 with the projection's options for periodic flows in .34 and 1.2 s, against
   .0112 and .0057 in .70 and 1.4 s; at 20^2 .058 against .032. Its preset does not converge there: its relaxation stirs.
