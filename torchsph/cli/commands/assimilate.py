@@ -98,10 +98,7 @@ def assimilate(args: argparse.Namespace) -> None:
     Under torchrun the processes share the ensemble's simulations; the first one writes and prints.
     """
     measured_path, truth_path, methods = _inputs(args)
-    files = [f"{name}{end}" for name in (*methods, "analysis") for end in (".h5", ".vtkhdf", "_wall.vtkhdf")]
-    files += ["members.h5", "quantities.json", "quantities.csv"]
-    files += ["report.png", "report.html", "filter.png", "metrics.json", "config.toml"]
-    folder = output_folder(args.out, files)
+    folder = output_folder(args.out, _files(methods))
     device = parallel.own_device(usable_device(args.device))
     lead = parallel.is_lead()
     held = locked(folder) if lead else nullcontext(folder)
@@ -155,6 +152,13 @@ def assimilate(args: argparse.Namespace) -> None:
         if "ensemble" in methods:
             saved.unlink(missing_ok=True)  # the run is complete: there is nothing to go on with
             (folder / SPACING_FILE).unlink(missing_ok=True)
+
+
+def _files(methods: Sequence[str]) -> list[str]:
+    """All that a run of these methods may leave in its folder."""
+    fields = [f"{name}{end}" for name in (*methods, "analysis") for end in (".h5", ".vtkhdf", "_wall.vtkhdf")]
+    tables = ["members.h5", "quantities.json", "quantities.csv"]
+    return [*fields, *tables, "report.png", "report.html", "filter.png", "metrics.json", "config.toml"]
 
 
 def _measurements(path: Path, args: argparse.Namespace) -> Sequence[geometry.Recording]:
